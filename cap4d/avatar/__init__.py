@@ -1,0 +1,1 @@
+"""The 4D avatar while it is being fitted."""

@@ -1,0 +1,1 @@
+"""The .cap4d file; FORMAT.md is its specification."""

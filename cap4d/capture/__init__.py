@@ -1,0 +1,1 @@
+"""A person on disk: images, mattes, cameras and rig parameters."""

@@ -1,0 +1,1 @@
+"""Differentiable splatting behind one call."""

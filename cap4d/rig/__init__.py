@@ -1,0 +1,1 @@
+"""Head models: one HeadRig, its importers, its UV grid."""

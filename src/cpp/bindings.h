@@ -1,0 +1,7 @@
+// One register function per noun; module.cpp calls them in order.
+#pragma once
+#include <pybind11/pybind11.h>
+
+namespace cap4d {
+void register_mesh(pybind11::module_& m);
+}  // namespace cap4d

@@ -1,0 +1,7 @@
+// cap4d._core: the table of contents. Shapes and ranges are checked by the Python that calls; here only types.
+#include "bindings.h"
+
+PYBIND11_MODULE(_core, m) {
+  m.doc() = "Fast maths of cap4d, without Python inside.";
+  cap4d::register_mesh(m);
+}

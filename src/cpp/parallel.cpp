@@ -1,0 +1,124 @@
+// A small persistent pool behind parallel_for. One job runs at a time; nested calls run on the calling thread.
+#include "parallel.h"
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <cstdlib>
+#include <exception>
+#include <memory>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace cap4d {
+namespace {
+
+thread_local bool inside_job = false;
+
+struct Job {
+  std::size_t n, grain;
+  const std::function<void(std::size_t, std::size_t)>* body;
+  std::atomic<std::size_t> next{0};
+  std::exception_ptr error;
+  std::mutex error_mutex;
+
+  void run() {
+    inside_job = true;
+    for (;;) {
+      const std::size_t begin = next.fetch_add(grain);
+      if (begin >= n) break;
+      try {
+        (*body)(begin, std::min(n, begin + grain));
+      } catch (...) {
+        std::lock_guard lock(error_mutex);
+        if (!error) error = std::current_exception();
+      }
+    }
+    inside_job = false;
+  }
+};
+
+class Pool {
+ public:
+  void run(Job& job, int helpers) {
+    std::unique_lock busy(busy_mutex_);
+    {
+      std::lock_guard lock(mutex_);
+      while (static_cast<int>(workers_.size()) < helpers) workers_.emplace_back([this] { work(); });
+      job_ = &job;
+      wanted_ = helpers;
+      active_ = 0;
+    }
+    wake_.notify_all();
+    job.run();
+    std::unique_lock lock(mutex_);
+    wanted_ = 0;  // a worker that has not started yet need not
+    done_.wait(lock, [this] { return active_ == 0; });
+    job_ = nullptr;
+  }
+
+  ~Pool() {
+    {
+      std::lock_guard lock(mutex_);
+      stop_ = true;
+    }
+    wake_.notify_all();
+    for (auto& worker : workers_) worker.join();
+  }
+
+ private:
+  void work() {
+    std::unique_lock lock(mutex_);
+    for (;;) {
+      wake_.wait(lock, [this] { return stop_ || wanted_ > 0; });
+      if (stop_) return;
+      --wanted_;
+      ++active_;
+      Job* job = job_;
+      lock.unlock();
+      job->run();
+      lock.lock();
+      if (--active_ == 0) done_.notify_all();
+    }
+  }
+
+  std::mutex busy_mutex_, mutex_;
+  std::condition_variable wake_, done_;
+  std::vector<std::thread> workers_;
+  Job* job_ = nullptr;
+  int wanted_ = 0, active_ = 0;
+  bool stop_ = false;
+};
+
+Pool& pool() {
+  static Pool* instance = new Pool;  // never destroyed: worker threads may outlive static destructors
+  return *instance;
+}
+
+}  // namespace
+
+int default_threads() {
+  if (const char* text = std::getenv("CAP4D_THREADS")) {
+    const int value = std::atoi(text);
+    if (value > 0) return std::min(value, 256);
+  }
+  return std::max(1u, std::thread::hardware_concurrency());
+}
+
+void parallel_for(std::size_t n, std::size_t grain, int threads, const std::function<void(std::size_t, std::size_t)>& body) {
+  if (n == 0) return;
+  grain = std::max<std::size_t>(1, grain);
+  if (threads <= 0) threads = default_threads();
+  const std::size_t chunks = (n + grain - 1) / grain;
+  const int helpers = static_cast<int>(std::min<std::size_t>(threads, chunks)) - 1;
+  if (helpers <= 0 || inside_job) {
+    for (std::size_t begin = 0; begin < n; begin += grain) body(begin, std::min(n, begin + grain));
+    return;
+  }
+  Job job{n, grain, &body};
+  pool().run(job, helpers);
+  if (job.error) std::rethrow_exception(job.error);
+}
+
+}  // namespace cap4d
