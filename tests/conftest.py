@@ -1,0 +1,36 @@
+"""Fixtures that many tests need."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared" / "data"
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Benches run only when asked for: `pytest -m bench`."""
+    if "bench" in (config.option.markexpr or ""):
+        return
+    skip = pytest.mark.skip(reason="a bench; run with `pytest -m bench`")
+    for item in items:
+        if "bench" in item.keywords:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real test data beside the checkout; tests that need it skip where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip("no ../shared/data beside the checkout")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def builtin_rig():
+    """The built-in head, built once."""
+    from cap4d.rig.builtin import build_head
+
+    return build_head()
