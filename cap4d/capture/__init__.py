@@ -1,1 +1,1 @@
-"""A person on disk: images, mattes, cameras and rig parameters."""
+"""Images, mattes, cameras and rig parameters of a person on disk (the FlowFace layout)."""
