@@ -43,7 +43,8 @@ def rasterize_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, c
         cull_back: Skip triangles seen from inside.
     """
     xyz = camera.project(np.asarray(vertices, np.float64))
-    xyz[xyz[:, 2] < MIN_DEPTH] = np.nan
+    # beyond 1e12 px edge functions would cancel, so such vertices count as not finite
+    xyz[~(np.abs(xyz).max(1) < 1e12) | (xyz[:, 2] < MIN_DEPTH)] = np.nan
     faces = np.ascontiguousarray(faces, np.int32)
     cull = "clockwise" if cull_back else "none"
     # 1/z is linear in the image, so it is the depth that orders triangles exactly (negated: nearer is smaller).
