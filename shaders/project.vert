@@ -1,0 +1,60 @@
+// Poses and projects one Gaussian. Runs over the depth order with transform feedback, so the splats land in the buffer
+// already sorted; splat.vert reads them from there, one per instance.
+#include "lib/rotation.glsl"
+#include "lib/triangle_frame.glsl"
+#include "lib/projection.glsl"
+#include "lib/spherical_harmonics.glsl"
+
+uniform sampler2D grid_vertices;  // vertex i at texel (i % width, i / width), m
+uniform mat4 viewmat;             // view from world
+uniform vec3 eye;                 // the optical centre in the world, m
+uniform vec4 intrinsics;          // fx, fy, cx, cy, px
+uniform vec2 image_size;          // px
+
+in vec4 mean_opacity;             // local mean, in units of the triangle's size; opacity after the sigmoid
+in vec4 quat;                     // wxyz, local
+in vec3 log_scale;                // local, in units of the triangle's size
+in uvec3 triangle;                // grid vertices
+in vec4 sh[SH_VEC4S];
+
+out vec2 mean2d;                  // px
+out vec3 conic;                   // xx, xy, yy, 1/px^2
+out vec4 color_opacity;
+out vec4 axes;                    // half axes of the ellipse alpha = ALPHA_MIN, px; zero: culled
+
+vec3 grid_vertex(uint index) {
+    int width = textureSize(grid_vertices, 0).x;
+    return texelFetch(grid_vertices, ivec2(int(index) % width, int(index) / width), 0).xyz;
+}
+
+// The half axes of the ellipse in which opacity * exp(-d'Sd/2) reaches ALPHA_MIN: eigenvectors of the covariance.
+vec4 cutoff_axes(vec3 covariance, float opacity) {
+    float reach = 2.0 * log(opacity / ALPHA_MIN);  // squared, in standard deviations
+    if (!(reach > 0.0)) return vec4(0.0);
+    float half_sum = 0.5 * (covariance.x + covariance.z);
+    float half_difference = 0.5 * (covariance.x - covariance.z);
+    float spread = length(vec2(half_difference, covariance.y));
+    // The eigenvector of the larger value, from the better conditioned row.
+    vec2 major = half_difference >= 0.0 ? vec2(half_difference + spread, covariance.y)
+                                        : vec2(covariance.y, spread - half_difference);
+    major = spread > 0.0 ? normalize(major) : vec2(1.0, 0.0);
+    float major_length = sqrt(reach * (half_sum + spread)) + 0.01;
+    float minor_length = sqrt(reach * max(half_sum - spread, LOW_PASS)) + 0.01;
+    return vec4(major * major_length, vec2(-major.y, major.x) * minor_length);
+}
+
+void main() {
+    TriangleFrame frame = triangle_frame(grid_vertex(triangle.x), grid_vertex(triangle.y), grid_vertex(triangle.z));
+    vec3 mean = frame.rotation * mean_opacity.xyz * frame.size + frame.centre;
+    vec3 view = (viewmat * vec4(mean, 1.0)).xyz;
+    mat3 view_rotation = mat3(viewmat) * frame.rotation * quat_to_rotmat(quat);
+    mat3 covariance = covariance_3d(view_rotation, exp(log_scale) * frame.size);
+    vec3 cov2d = covariance_2d(covariance, view, Pinhole(intrinsics.xy, intrinsics.zw, image_size));
+    float determinant = cov2d.x * cov2d.z - cov2d.y * cov2d.y;
+
+    float opacity = mean_opacity.w;
+    mean2d = view.xy / view.z * intrinsics.xy + intrinsics.zw;
+    conic = vec3(cov2d.z, -cov2d.y, cov2d.x) / determinant;
+    color_opacity = vec4(eval_sh(sh, normalize(mean - eye)), opacity);
+    axes = view.z >= NEAR && determinant > 0.0 ? cutoff_axes(cov2d, opacity) : vec4(0.0);
+}
