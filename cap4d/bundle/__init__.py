@@ -1,1 +1,8 @@
-"""The .cap4d file; FORMAT.md is its specification."""
+"""The `.cap4d` file: one avatar, everything a player needs and nothing else. FORMAT.md is its specification."""
+
+from cap4d.bundle.bundle import Bundle
+from cap4d.bundle.inspect import describe
+from cap4d.bundle.reader import read_bundle, read_manifest
+from cap4d.bundle.writer import write_bundle
+
+__all__ = ["Bundle", "describe", "read_bundle", "read_manifest", "write_bundle"]

@@ -1,0 +1,206 @@
+"""Reads just enough of an ONNX file, with bounds checks, to refuse one that is more than a plain network.
+
+An ONNX file can name other files to read (external data), operators of other libraries, and whole programs
+(subgraphs, functions). A deformer needs none of these. This is a scanner of protobuf's wire format
+(protobuf.dev/programming-guides/encoding); field numbers are those of onnx.proto, IR version 3 to 13.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+from cap4d.errors import DataError
+
+MAX_BYTES = 512 << 20
+MAX_NODES, MAX_TENSORS, MAX_DIMS, MAX_FIELDS = 2048, 2048, 8, 1 << 16
+MIN_OPSET, MAX_OPSET = 13, 26
+FLOAT, FLOAT16 = 1, 10
+ITEM_BYTES = {FLOAT: 4, 2: 1, 3: 1, 6: 4, 7: 8, 9: 1, FLOAT16: 2}  # + uint8, int8, int32, int64, bool
+
+# What a network on images is made of. No control flow, no random numbers, no input or output of files, strings or
+# sequences, and nothing whose output size is a number in the file (Tile, Range, ConstantOfShape, Resize).
+OPERATORS = frozenset(
+    """Abs Add AveragePool BatchNormalization Cast CastLike Clip Concat Constant Conv ConvTranspose Cos
+    DequantizeLinear Div DynamicQuantizeLinear Elu Erf Exp Expand Flatten Floor Gather Gelu Gemm GlobalAveragePool
+    GroupNormalization HardSigmoid Identity InstanceNormalization LayerNormalization LeakyRelu Log MatMul
+    MatMulInteger ConvInteger Max MaxPool Mean Min Mul Neg Pad Pow PRelu QuantizeLinear QLinearConv QLinearMatMul
+    Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum ReduceSumSquare Relu Reshape Shape Sigmoid Sin Slice
+    Softplus Split Sqrt Squeeze Sub Sum Tanh Transpose Unsqueeze Where""".split()
+)
+
+VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+
+
+class _Malformed(Exception):
+    """What is wrong, as (field, expected, found)."""
+
+
+@dataclass(frozen=True)
+class OnnxSummary:
+    """What a scanned network holds: its opset, its number of nodes and of bytes of weights."""
+
+    opset: int
+    nodes: int
+    weight_bytes: int
+
+
+def scan_onnx(data: bytes, *, source: str, size: int) -> OnnxSummary:
+    """Checks that `data` is a self-contained network float32[1, 3, size, size] `offsets` -> the same, `deformation`.
+
+    Raises:
+        DataError: It is not, or uses anything beyond plain operators.
+    """
+    try:
+        return _scan_model(memoryview(data), size)
+    except _Malformed as error:
+        field, expected, found = error.args
+        raise DataError(source, field, expected=expected, found=found) from None
+
+
+def _scan_model(data: memoryview, size: int) -> OnnxSummary:
+    _require(len(data) <= MAX_BYTES, "size", f"at most {MAX_BYTES} bytes", len(data))
+    model = _message(data, "ModelProto", {1, 2, 3, 4, 5, 6, 7, 8, 14})
+    _require(len(model[7]) == 1, "graph", "one graph", len(model[7]))
+    opsets = [_message(_bytes(o, "opset_import"), "opset_import", {1, 2}) for o in model[8]]
+    domains = {_text(o[1][-1]) if o[1] else "" for o in opsets}
+    _require(domains <= {"", "ai.onnx"}, "opset_import.domain", "ai.onnx", sorted(domains))
+    versions = [o[2][-1] for o in opsets if o[2]]
+    good = len(versions) == 1 and isinstance(versions[0], int) and MIN_OPSET <= versions[0] <= MAX_OPSET
+    _require(good, "opset_import.version", f"one of {MIN_OPSET} to {MAX_OPSET}", versions)
+    nodes, weights = _scan_graph(_bytes(model[7][0], "graph"), size)
+    return OnnxSummary(versions[0], nodes, weights)
+
+
+def _scan_graph(data: memoryview, size: int) -> tuple[int, int]:
+    graph = _message(data, "GraphProto", {1, 2, 5, 10, 11, 12, 13, 16})
+    _require(len(graph[1]) <= MAX_NODES, "graph.node", f"at most {MAX_NODES}", len(graph[1]))
+    _require(len(graph[5]) <= MAX_TENSORS, "graph.initializer", f"at most {MAX_TENSORS}", len(graph[5]))
+    _scan_value(graph[11], "input", "offsets", size)
+    _scan_value(graph[12], "output", "deformation", size)
+    weights = sum(_scan_tensor(_bytes(t, "initializer")) for t in graph[5])
+    weights += sum(_scan_node(_bytes(n, "node")) for n in graph[1])
+    return len(graph[1]), weights
+
+
+def _scan_value(values: list, field: str, name: str, size: int) -> None:
+    _require(len(values) == 1, f"graph.{field}", f"only `{name}`", f"{len(values)} of them")
+    value = _message(_bytes(values[0], field), f"graph.{field}", {1, 2, 3, 4})
+    found = _text(value[1][-1]) if value[1] else ""
+    _require(found == name, f"graph.{field}", f"`{name}`", repr(found[:64]))
+    _require(len(value[2]) == 1, f"graph.{field}.type", "one type", len(value[2]))
+    kind = _message(_bytes(value[2][0], field), f"graph.{field}.type", {1, 6})
+    _require(len(kind[1]) == 1, f"graph.{field}.type", "a tensor", "something else")
+    tensor = _message(_bytes(kind[1][0], field), f"graph.{field}.type", {1, 2})
+    _require(tensor[1] == [FLOAT], f"graph.{field}.elem_type", f"{FLOAT} (float32)", tensor[1])
+    _require(len(tensor[2]) == 1, f"graph.{field}.shape", "one shape", len(tensor[2]))
+    shape = _message(_bytes(tensor[2][0], field), f"graph.{field}.shape", {1})
+    dims = [_message(_bytes(d, field), f"graph.{field}.shape", {1, 2, 3})[1] for d in shape[1]]
+    sizes = [d[0] if len(d) == 1 else None for d in dims]
+    _require(sizes == [1, 3, size, size], f"graph.{field}.shape", f"[1, 3, {size}, {size}]", sizes)
+
+
+def _scan_node(data: memoryview) -> int:
+    node = _message(data, "NodeProto", {1, 2, 3, 4, 5, 6, 7, 9})
+    domain = _text(node[7][-1]) if node[7] else ""
+    _require(domain in ("", "ai.onnx"), "node.domain", "ai.onnx", repr(domain[:64]))
+    operator = _text(node[4][-1]) if node[4] else ""
+    _require(operator in OPERATORS, "node.op_type", "a plain operator (see FORMAT.md)", repr(operator[:64]))
+    return sum(_scan_attribute(_bytes(a, "attribute")) for a in node[5])
+
+
+def _scan_attribute(data: memoryview) -> int:
+    # Left out: 6 and 11, graphs; 14 and 15, types; 21, a function's argument; 22 and 23, sparse tensors.
+    attribute = _message(data, "AttributeProto", {1, 2, 3, 4, 5, 7, 8, 9, 10, 13, 20})
+    return sum(_scan_tensor(_bytes(t, "attribute.t")) for t in attribute[5] + attribute[10])
+
+
+def _scan_tensor(data: memoryview) -> int:
+    # Left out: 3, a segment; 6, strings; 13, external data. 14 is the place of the data and must say "here".
+    tensor = _message(data, "TensorProto", {1, 2, 4, 5, 7, 8, 9, 10, 11, 12, 14, 16})
+    _require(tensor[14] in ([], [0]), "tensor.data_location", "0 (inside the file)", tensor[14])
+    kind = tensor[2][-1] if tensor[2] else None
+    _require(kind in ITEM_BYTES, "tensor.data_type", f"one of {sorted(ITEM_BYTES)}", kind)
+    dims = _integers(tensor[1], "tensor.dims")
+    good = len(dims) <= MAX_DIMS and all(0 <= d < 1 << 31 for d in dims)
+    _require(good, "tensor.dims", f"at most {MAX_DIMS} sizes", dims[: MAX_DIMS + 1])
+    if not tensor[9]:  # small tensors may hold typed lists; those cannot outgrow the file either
+        return 0
+    raw = _bytes(tensor[9][-1], "tensor.raw_data")
+    wanted = math.prod(dims) * ITEM_BYTES[kind]
+    _require(len(tensor[9]) == 1 and len(raw) == wanted, "tensor.raw_data", f"{wanted} bytes", len(raw))
+    if kind in (FLOAT, FLOAT16):
+        values = np.frombuffer(raw, "<f4" if kind == FLOAT else "<f2")
+        _require(
+            bool(np.isfinite(values).all()), "tensor.raw_data", "finite weights", "a value that is not finite"
+        )
+    return len(raw)
+
+
+def _message(data: memoryview, name: str, known: set[int]) -> defaultdict[int, list]:
+    """The fields of one message: number -> values in order, each an int or a memoryview."""
+    fields: defaultdict[int, list] = defaultdict(list)
+    at = count = 0
+    while at < len(data):
+        key, at = _varint(data, at)
+        count += 1
+        _require(count <= MAX_FIELDS, name, f"at most {MAX_FIELDS} fields", "more")
+        number, wire = key >> 3, key & 7
+        _require(number in known, name, f"only fields {sorted(known)}", f"field {number}")
+        if wire == VARINT:
+            value, at = _varint(data, at)
+        elif wire == BYTES:
+            length, at = _varint(data, at)
+            value, at = data[at : at + length], at + length
+        elif wire in (FIXED32, FIXED64):
+            length = 4 if wire == FIXED32 else 8
+            value, at = data[at : at + length], at + length
+        else:
+            raise _Malformed(name, "wire type 0, 1, 2 or 5", wire)
+        _require(at <= len(data), name, "a whole message", "one cut short")
+        fields[number].append(value)
+    return fields
+
+
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
+    value = 0
+    for i in range(10):
+        _require(at + i < len(data), "protobuf", "a whole number", "one cut short")
+        byte = data[at + i]
+        value |= (byte & 0x7F) << (7 * i)
+        if byte < 0x80:
+            return value, at + i + 1
+    raise _Malformed("protobuf", "a number of at most 10 bytes", "more")
+
+
+def _integers(values: list, field: str) -> list[int]:
+    """A repeated integer field, packed or not."""
+    numbers: list[int] = []
+    for value in values:
+        if isinstance(value, int):
+            numbers.append(value)
+            continue
+        at = 0
+        while at < len(value):
+            number, at = _varint(value, at)
+            numbers.append(number)
+            _require(len(numbers) <= MAX_DIMS, field, f"at most {MAX_DIMS} numbers", "more")
+    return numbers
+
+
+def _bytes(value: int | memoryview, field: str) -> memoryview:
+    if isinstance(value, int):
+        raise _Malformed(field, "a message", "a number")
+    return value
+
+
+def _text(value: int | memoryview) -> str:
+    return bytes(_bytes(value, "string")).decode("utf-8", "backslashreplace")
+
+
+def _require(holds: bool, field: str, expected: str, found: object) -> None:
+    if not holds:
+        raise _Malformed(field, expected, found)
