@@ -1,0 +1,191 @@
+"""What is set into the skin or worn on it: eyeballs, teeth, tongue, ears, hair, shirt. Half of each, in millimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cap4d.rig.builtin.field import EYE, EYE_RADIUS, cast
+from cap4d.rig.builtin.sheet import Grid, Part, curve, smoothstep
+
+PUPIL, IRIS = 0.165, 0.445  # rad from the gaze axis
+MOUTH_HEIGHT = -53.5
+
+
+def grid_part(name: str, points: np.ndarray, uv: np.ndarray, *, pole: bool = False, ring: bool = False, **marks) -> Part:
+    """A part of one grid [R, C, 3]; `pole`: its first row is one point; `ring`: its last column is its first."""
+    rows, columns = points.shape[:2]
+    ids = np.arange(rows * columns).reshape(rows, columns)
+    if ring:
+        ids[:, -1] = ids[:, 0]
+    if pole:
+        ids[0] = ids[0, 0]
+    used = np.unique(ids)
+    new = np.zeros(rows * columns, int)
+    new[used] = np.arange(len(used))
+    flat = {k: np.broadcast_to(m, (rows, columns)).reshape(-1)[used] for k, m in marks.items()}
+    return Part(name, points.reshape(-1, 3)[used], (Grid(new[ids], uv),), np.zeros((len(used), 3)), flat)
+
+
+def disc_uv(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """[..., 2] a point of the unit square at `radius` in [0, 1] from its middle; angle 0 is up, growing to the right."""
+    return 0.5 + 0.5 * np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1)
+
+
+def build_eye() -> Part:
+    """The front of an eyeball: rings about the gaze, close together where pupil and iris end."""
+    rings = np.array([0, 0.08, 0.150, PUPIL, 0.18, 0.26, 0.34, 0.41, IRIS - 0.015, IRIS + 0.01, 0.5, 0.6, 0.75, 0.95, 1.2, 1.5, 1.75])
+    around = np.linspace(0, 2 * np.pi, 41)
+    a, phi = np.meshgrid(rings, around, indexing="ij")
+    radius = EYE_RADIUS + 0.35 * smoothstep(IRIS + 0.05, 0.1, a)
+    points = EYE + radius[..., None] * np.stack([np.sin(a) * np.sin(phi), np.sin(a) * np.cos(phi), np.cos(a)], -1)
+    uv = disc_uv((a / rings[-1]) ** 0.8, phi)
+    return grid_part("eye", points[:, ::-1], uv[:, ::-1], pole=True, ring=True, angle=a, turn=phi[:, ::-1])
+
+
+def arch(tau: np.ndarray, width: float, front: float, depth: float) -> tuple[np.ndarray, np.ndarray]:
+    """x and z of a dental arch at parameter tau in [0, 1]."""
+    angle = 1.35 * tau
+    return width * np.sin(angle), front - depth * (1 - np.cos(angle))
+
+
+def build_teeth(name: str, sign: float, width: float, front: float, edge: float, gum: float) -> Part:
+    """A row of teeth with its gum: from behind the gum's top over the front of the crowns to behind their edges.
+
+    Args:
+        sign: 1 for the upper row, -1 for the lower.
+        edge, gum: Heights of the biting edge and of the gum line, mm.
+    """
+    bounds = np.array([0, 8.2, 14.6, 21.6, 28.0, 34.5, 43.0]) * (1.0 if sign > 0 else 0.74)
+    tau = np.linspace(0, 1, 50)
+    x, z = arch(tau, width, front, 30.0)
+    length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
+    tooth = np.clip(np.searchsorted(bounds, length, "right") - 1, 0, len(bounds) - 2)
+    across = np.clip((length - bounds[tooth]) / (bounds[tooth + 1] - bounds[tooth]), 0, 1)
+    crown = 1 - np.abs(2 * across - 1) ** 5
+    gap = 1 - np.abs(2 * across - 1) ** 8
+    # rows: height share from gum (0) to edge (1), how far forward (mm), which share of the scallop shows
+    rows = np.array([[-0.75, -2.5, 0], [-0.35, 0.6, 0], [-0.04, 0.8, 0.2], [0.06, 0.2, 0.6], [0.3, 0.9, 1], [0.6, 1.1, 1], [0.85, 0.8, 1], [0.97, 0.2, 1], [1.0, -0.8, 0.8], [0.7, -3.2, 0.2]])
+    normal = np.stack([x * 0.55 + 1e-9, 0 * x, np.full_like(x, 18.0)], -1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = gum + (edge - gum) * rows[:, :1]
+    scallop = 0.9 * (gap - 1) * rows[:, 2:]
+    rounding = sign * 0.9 * (1 - crown) * smoothstep(0.5, 1.0, rows[:, :1])
+    points = np.stack([np.broadcast_to(x, height.shape[:1] + x.shape), height + rounding, np.broadcast_to(z, height.shape[:1] + x.shape)], -1)
+    points = points + (rows[:, 1:2] + scallop)[..., None] * normal
+    points[:, 0, 0] = 0
+    order = slice(None) if sign > 0 else slice(None, None, -1)
+    u, v = np.meshgrid(np.linspace(0.5, 1, len(tau)), np.linspace(1, 0, len(rows)))
+    share = np.broadcast_to(rows[:, :1], v.shape)
+    return grid_part(name, points[order], np.stack([u, v], -1), enamel=share[order], gap=np.broadcast_to(gap, v.shape)[order])
+
+
+def build_tongue() -> Part:
+    """A flat rounded tongue, a closed form with its poles at the tip and the root."""
+    s, phi = np.meshgrid(np.linspace(0, 1, 15), np.linspace(0, np.pi, 13), indexing="ij")
+    along = np.pi * s
+    girth = np.sin(along) ** 0.62
+    points = np.stack([
+        17 * girth * np.sin(phi),
+        -62 + 6.0 * girth * np.cos(phi) - 1.2 * girth * np.exp(-((phi / 0.35) ** 2)) + 3 * np.sin(along * 0.5) ** 2,
+        46 + 25 * np.cos(along),
+    ], -1)
+    points[:, [0, -1], 0] = 0
+    uv = np.stack([0.5 + 0.5 * phi / np.pi, 1 - s], -1)
+    uv = disc_uv(s, np.pi - phi) if False else np.stack([0.5 + 0.5 * np.sin(phi / 2) * 1.0, 1 - s], -1)
+    return grid_part("tongue", points[:, ::-1][:, ::-1], uv, pole=True, tip=1 - s)
+
+
+def build_ear() -> Part:
+    """An ear as a disc seen from its side: bowl, inner ridge, groove, rolled rim; then its back down to the head."""
+    rho = np.concatenate([np.linspace(0, 1, 17), [1.0, 0.97, 0.88, 0.76, 0.66]])
+    back = np.arange(len(rho)) > 16
+    phi = np.linspace(0, 2 * np.pi, 49)  # 0 is up, growing towards the face
+    r, f = np.meshgrid(rho, phi, indexing="ij")
+    behind = np.broadcast_to(back[:, None], r.shape)
+    up, fore = np.cos(f), np.sin(f)
+    tall = np.where(up > 0, 29.0, 31.0)
+    wide = np.where(fore > 0, 13.0, 19.0) * (1 + 0.18 * up - 0.12 * (up < 0) * up**2 * 2)
+    b, a = tall * up * r, -wide * fore * r  # up and backward in the ear's plane
+    lobe = smoothstep(-0.45, -0.95, np.cos(f) * np.minimum(r * 1.2, 1))
+    face = smoothstep(0.2, 0.9, fore)
+    bump = lambda c, w: np.exp(-(((r - c) / w) ** 2))  # noqa: E731
+    height = -6.5 * smoothstep(0.52, 0.12, r) + 3.0 * bump(0.62, 0.12) * (1 - face) - 1.8 * bump(0.78, 0.07) * (1 - face)
+    height += 3.6 * bump(0.93, 0.085) * (1 - 0.75 * lobe) + 2.0 * lobe * bump(0.7, 0.3)
+    height += 4.5 * face * np.exp(-(((b + 4) / 6.5) ** 2)) * bump(0.62, 0.2)  # tragus
+    height -= 5.0 * face * smoothstep(0.72, 1.0, r)  # the front edge sinks into the cheek
+    height = np.where(behind, np.array([0] * 17 + [-1.5, -4.0, -6.5, -9.0, -12.0])[:, None] - 5 * face, height)
+    tilt = np.radians(27)
+    backward = np.array([np.sin(tilt), -0.12, -np.cos(tilt)])
+    outward = np.array([np.cos(tilt), 0.05, np.sin(tilt)])
+    upward = np.array([0.10, 0.985, -0.14])
+    points = np.array([75.5, 3.0, -9.0]) + a[..., None] * backward + b[..., None] * upward + height[..., None] * outward
+    uv = disc_uv(np.where(behind, 0.8 + 0.2 * np.linspace(0, 1, 5)[np.maximum(np.arange(len(rho)) - 17, 0)][:, None], r * 0.8), f)
+    uv[..., 0] = 1 - uv[..., 0]
+    return grid_part("ear", points, uv, pole=True, ring=True, height=height, rho=r, behind=behind * 1.0)
+
+
+HAIRLINE = ((0, 88), (14, 87), (30, 85), (42, 74), (52, 54), (62, 40), (70, 22), (76, 6), (81, 6), (86, 30), (96, 42), (108, 34), (116, 8), (124, -16), (140, -40), (160, -54), (180, -58))
+THICKNESS = ((0, 15), (30, 14), (50, 9), (70, 5), (84, 5), (110, 8), (140, 9), (180, 9))
+
+
+def build_hair() -> Part:
+    """Short combed-back hair: a shell from the crown to the hairline, standing off the skull, its edge under the skin."""
+    theta = np.concatenate([np.linspace(0, 60, 25), np.linspace(60, 180, 41)[1:]])
+    angle = np.radians(theta)
+    outward = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    line = curve(theta, list(HAIRLINE), soft=2.5)
+    edge = cast(np.stack([0 * line, line, 0 * line], -1), outward)
+    centre = np.array([0, 40.0, -12.0])
+    crown = np.array([0, 1.0, -0.25]) / np.hypot(1, 0.25)
+    arm = (edge - centre) / np.linalg.norm(edge - centre, axis=1, keepdims=True)
+    full = np.arccos(np.clip(arm @ crown, -1, 1))
+    s = np.concatenate([np.linspace(0, 0.9, 31), [0.93, 0.955, 0.975, 0.99, 1.0]])
+    turn = s[:, None] * full
+    side = arm - (arm @ crown)[:, None] * crown
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    rays = np.cos(turn)[..., None] * crown + np.sin(turn)[..., None] * side
+    skull = cast(np.broadcast_to(centre, rays.shape).reshape(-1, 3), rays.reshape(-1, 3)).reshape(rays.shape)
+    locks = strands(turn, angle[None])
+    thick = curve(theta, list(THICKNESS), soft=6.0)
+    thick = 13 + (thick - 13) * smoothstep(0.1, 0.75, s)[:, None]
+    rise = np.sqrt(np.maximum(1 - s**7, 0))[:, None] * thick * (0.88 + 0.24 * locks) - 2.0 * s[:, None] ** 12
+    points = skull + rise[..., None] * rays
+    points[:, [0, -1], 0] = 0
+    share = np.broadcast_to(s[:, None], turn.shape)
+    fan = angle / np.pi  # the fan of the half: from straight down (front) to the right (back)
+    uv = np.stack([0.5 + 0.5 * share * np.sin(fan * np.pi / 2) ** 0.9, 1 - share * np.cos(fan * np.pi / 2) ** 0.9], -1)
+    return grid_part("hair", points, uv, pole=True, lock=locks, share=share)
+
+
+def strands(turn: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """[R, C] in [0, 1]: locks that run from the hairline back over the crown."""
+    flow = 9 * angle + 1.2 * np.sin(2.2 * turn + 2 * angle)
+    fine = 0.5 + 0.5 * np.sin(31 * angle + 2.5 * turn + 1.5 * np.sin(3 * turn))
+    broad = 0.5 + 0.5 * np.cos(flow)
+    fade = smoothstep(0.05, 0.5, turn)
+    return (0.7 * broad + 0.3 * fine) * fade + 0.5 * (1 - fade)
+
+
+def build_shirt() -> Part:
+    """A crew-neck shirt over neck, shoulders and chest, open below."""
+    theta = np.radians(np.linspace(0, 180, 41))
+    # rows: half width, half depth, height in front / at the side / behind, mm
+    rings = np.array([
+        [55, 54, -160, -146, -136], [58, 57, -159, -144, -134], [60.5, 59, -160, -144, -134], [62, 60.5, -163, -147, -137],
+        [63, 62, -168, -151, -141], [66, 64, -172, -154, -144], [80, 70, -180, -160, -152], [104, 78, -191, -168, -163],
+        [132, 86, -205, -177, -175], [158, 93, -222, -188, -190], [179, 100, -240, -202, -207], [194, 106, -260, -222, -227],
+        [202, 110, -282, -246, -250], [205, 113, -305, -274, -276], [205, 115, -328, -304, -304], [203, 116, -345, -335, -335],
+    ])
+    wide, deep, front, side, back = rings.T[..., None]
+    bend = np.cos(theta)
+    height = np.where(bend > 0, side + (front - side) * bend**2, side + (back - side) * bend**2)
+    squareness = np.linspace(1.0, 0.82, len(rings))[:, None]
+    x = wide * np.abs(np.sin(theta)) ** squareness
+    z = deep * np.sign(bend) * np.abs(bend) ** squareness - 40
+    points = np.stack([x, height, z], -1)
+    points[:, [0, -1], 0] = 0
+    band = np.broadcast_to((np.arange(len(rings)) < 6)[:, None] * 1.0, x.shape)
+    share = np.linspace(0.25, 1, len(rings))[:, None]
+    fan = theta / 2
+    uv = np.stack([0.5 + 0.5 * share * np.sin(fan), 1 - share * np.cos(fan)], -1)
+    return grid_part("shirt", points, uv, band=band)

@@ -1,0 +1,273 @@
+"""The skin from the hidden scalp to the neck: one grid of rows and columns that opens at the eyes and at the mouth.
+
+Columns are half-planes of constant azimuth about the vertical axis (0 is the face's middle, 180 the back). Rows are
+lofted between landmark lines (KEYS), and two of the rows are doubled where the lids and the lips part, so that lid and
+lip rims are clean edge loops. The rows inside lids and lips, and the mouth's pouch, hang on those rims.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cap4d.rig.builtin.field import EYE, EYE_RADIUS, LID_RADIUS, cast, head_distance, settle
+from cap4d.rig.builtin.sheet import Grid, Part, curve, smoothstep
+
+CORNER = 16.5  # deg; the inner eye corner and the mouth corner share a column
+OUTER = 37.0  # deg; outer eye corner
+SPANS = ((0.0, CORNER, 17), (CORNER, OUTER, 20), (OUTER, 60.0, 12), (60.0, 120.0, 15), (120.0, 180.0, 8))
+CORNER_COLUMN, OUTER_COLUMN = 17, 37
+
+# Landmark lines: height in mm by azimuth in degrees, and the number of rows from the line above.
+BACK = ((112, 0.0), (132, -30.0), (150, -56.0), (180, -62.0))
+KEYS = (
+    ("hidden", 0, ((0, 101), (30, 99), (50, 86), (65, 66), (80, 54), (95, 52), (112, 40), (132, 0), (150, -25), (180, -32))),
+    ("hair", 4, ((0, 78), (30, 76), (50, 62), (70, 45), (90, 38), (112, 26), (132, -8), (150, -36), (180, -42))),
+    ("brow", 10, ((0, 43), (25, 45), (38, 42), (55, 34), (75, 26), (90, 22), (112, 10), (132, -18), (150, -46), (180, -52))),
+    ("crease", 9, ((0, 31), (16, 30), (37, 29), (48, 25), (60, 20), (80, 14), (95, 8), (112, -2), (132, -28), (150, -54), (180, -60))),
+    ("upper_lid", 7, ((0, 18.5), (16, 18.2), (37, 20), (48, 17), (62, 12), (80, 6), (95, 0), (112, -10), (132, -35), (150, -60), (180, -66))),
+    ("lower_lid", 1, ((0, 18.5), (16, 18.2), (37, 20), (48, 17), (62, 12), (80, 6), (95, 0), (112, -10), (132, -35), (150, -60), (180, -66))),
+    ("under_lid", 6, ((0, 8), (16, 8), (25, 6.5), (37, 9), (50, 6), (65, 1), (80, -5), (95, -10), (112, -19), (132, -41), (150, -65), (180, -70))),
+    ("nose", 23, ((0, -31), (30, -31), (45, -33), (60, -36), (80, -38), (95, -39), (112, -42), (132, -56), (150, -74), (180, -78))),
+    ("upper_vermilion", 7, ((0, -46), (30, -47), (45, -48), (60, -49), (80, -49), (95, -50), (112, -52), (132, -63), (150, -79), (180, -83))),
+    ("upper_lip", 7, ((0, -53.5), (16.5, -54), (30, -55), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
+    ("lower_lip", 1, ((0, -53.5), (16.5, -54), (30, -55), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
+    ("lower_vermilion", 7, ((0, -64), (30, -62.5), (45, -63), (60, -63), (80, -63), (95, -65), (112, -66), (132, -73), (150, -87), (180, -90))),
+    ("chin", 12, ((0, -86), (40, -81), (60, -74), (80, -70), (95, -70), (120, -78), (150, -97), (180, -99))),
+    ("jaw", 8, ((0, -102), (20, -100), (40, -91), (60, -81), (80, -74), (95, -74), (120, -84), (150, -107), (180, -110))),
+    ("throat", 10, ((0, -120), (40, -116), (60, -108), (95, -98), (120, -100), (150, -122), (180, -125))),
+    ("collar", 12, ((0, -195), (180, -195))),
+)
+EYE_OPEN = (6.6, -5.6)  # mm the lid rims bow up and down from the line between the corners
+LIP_ROWS, LID_ROWS = 4, 3
+
+
+def azimuths() -> np.ndarray:
+    """[C] deg, the columns of the left half."""
+    spans = [np.linspace(a, b, n, endpoint=False) for a, b, n in SPANS]
+    return np.concatenate([*spans, [180.0]])
+
+
+def row_of(key: str) -> int:
+    """The row that lies on a landmark line."""
+    counts = np.cumsum([n for _, n, _ in KEYS])
+    return int(counts[[k for k, _, _ in KEYS].index(key)])
+
+
+def lid_bow(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far the upper and the lower lid's rim bow from the line between the eye's corners, mm."""
+    u = np.clip((theta - CORNER) / (OUTER - CORNER), 0, 1)
+    upper = EYE_OPEN[0] * np.sin(np.pi * u**0.86) ** 0.72
+    lower = EYE_OPEN[1] * np.sin(np.pi * u**1.12) ** 0.85
+    return upper, lower
+
+
+def vermilion(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Heights in mm of the red of the upper and lower lip at u in [0, 1] from the middle to the corner."""
+    arch = np.maximum(1 - u**2.2, 0) ** 0.8
+    upper = 7.2 * arch + 1.0 * np.exp(-(((u - 0.24) / 0.13) ** 2)) - 0.6 * np.exp(-((u / 0.1) ** 2))
+    lower = 9.6 * np.maximum(1 - u**2.1, 0) ** 0.85
+    return upper, lower
+
+
+def row_heights(theta: np.ndarray) -> np.ndarray:
+    """[R, C] the height of every row at every column, mm."""
+    lines = {key: curve(theta, list(knots), soft=4.0) for key, _, knots in KEYS}
+    up, low = lid_bow(theta)
+    lines["upper_lid"] = lines["upper_lid"] + up
+    lines["lower_lid"] = lines["lower_lid"] + low
+    lines["crease"] = np.maximum(lines["crease"], lines["upper_lid"] + 5.5 * smoothstep(60, 30, theta) + 1)
+    red_up, red_low = vermilion(np.clip(theta / CORNER, 0, 1))
+    inside = smoothstep(CORNER + 9, CORNER - 3, theta)
+    lines["upper_vermilion"] = (1 - inside) * lines["upper_vermilion"] + inside * (lines["upper_lip"] + np.maximum(red_up, 1.4))
+    lines["lower_vermilion"] = (1 - inside) * lines["lower_vermilion"] + inside * (lines["lower_lip"] - np.maximum(red_low, 1.4))
+    rows = [lines[KEYS[0][0]][None]]
+    for (above, _, _), (below, n, _) in zip(KEYS[:-1], KEYS[1:], strict=True):
+        t = np.arange(1, n + 1)[:, None] / n
+        rows.append((1 - t) * lines[above] + t * lines[below])
+    return np.concatenate(rows)
+
+
+def skin_grid() -> tuple[np.ndarray, np.ndarray]:
+    """[R, C, 3] points of the main grid on the bare head, mm, and [C] azimuths."""
+    theta = azimuths()
+    heights = row_heights(theta)
+    jaw, throat = row_of("jaw"), row_of("throat")
+    rows, columns = heights.shape
+    axis = np.zeros(rows)
+    axis[jaw:] = np.interp(np.arange(jaw, rows), [jaw, throat, rows], [0, -30, -38])
+    origins = np.zeros((rows, columns, 3))
+    origins[..., 1], origins[..., 2] = heights, axis[:, None]
+    angle = np.radians(theta)
+    directions = np.broadcast_to(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1), origins.shape)
+    points = cast(origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(rows, columns, 3)
+    for r in range(jaw + 1, throat):  # the underside of the jaw, where level rays graze
+        t = (r - jaw) / (throat - jaw)
+        points[r] = (1 - t) * points[jaw] + t * points[throat]
+    under = slice(jaw + 1, throat)
+    points[under] = settle(points[under].reshape(-1, 3)).reshape(points[under].shape)
+    points[:, [0, -1], 0] = 0
+    return points, theta
+
+
+def lip_relief(points: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """[R, C, 3] the main grid with lips, philtrum and mouth corners raised from the bare head."""
+    points = points.copy()
+    rows = np.arange(len(points))[:, None]
+    top, upper, lower, bottom = (row_of(k) for k in ("upper_vermilion", "upper_lip", "lower_lip", "lower_vermilion"))
+    u = theta / CORNER
+    taper = np.maximum(1 - np.minimum(u, 1) ** 2.4, 0) ** 0.7
+    t_up = np.clip((rows - top) / (upper - top), -2, 1)
+    t_low = np.clip((bottom - rows) / (bottom - lower), -2, 1)
+    upper_lip = np.where(t_up >= 0, 1.4 + 3.4 * np.sin(np.pi * 0.62 * np.maximum(t_up, 0)) - 2.4 * np.maximum(t_up, 0) ** 4, 1.4 * smoothstep(-1.2, 0, t_up))
+    lower_lip = np.where(t_low >= 0, 0.6 + 5.2 * np.sin(np.pi * 0.66 * np.maximum(t_low, 0)) - 2.4 * np.maximum(t_low, 0) ** 4, 0.6 * smoothstep(-0.8, 0, t_low))
+    push = taper * np.where(rows <= upper, upper_lip, lower_lip)
+    y, line = points[..., 1], points[upper, :, 1]
+    corner = np.exp(-(((theta - CORNER) / 2.6) ** 2) - ((y - line) / 4.5) ** 2)
+    push = push - 2.6 * corner
+    nose = points[row_of("nose"), 0, 1]
+    between = smoothstep(nose + 2, nose - 5, y) * smoothstep(points[top, 0, 1] - 3, points[top, 0, 1] + 2, y)
+    x = points[..., 0]
+    push = push + between * (0.9 * np.exp(-(((x - 5.0) / 2.3) ** 2)) - 1.0 * np.exp(-((x / 3.0) ** 2)))
+    angle = np.radians(0.6 * theta)
+    points += push[..., None] * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    points[:, 0, 0] = 0
+    return points
+
+
+def inside_lids(rim: np.ndarray, sign: float) -> np.ndarray:
+    """[LID_ROWS, K, 3] rows behind a lid's rim [K, 3]: over the rim's edge, then away between lid and eyeball."""
+    arm = rim - EYE
+    u = np.linspace(0, 1, len(rim))
+    open_ = np.sin(np.pi * u) ** 0.5
+    rows = []
+    for depth, lift in ((0.0, 0.35), (0.0, 3.2), (0.0, 6.0)):
+        moved = arm + sign * lift * open_[:, None] * np.array([0, 1.0, 0]) - 0.8 * np.array([0, 0, 1.0])
+        radius = np.linalg.norm(moved, axis=1, keepdims=True)
+        wanted = np.minimum(EYE_RADIUS + 0.12 - depth, np.linalg.norm(arm, axis=1, keepdims=True) - 1.0)
+        rows.append(EYE + moved / radius * wanted)
+    rows = np.stack(rows)
+    for k in range(len(rows)):  # both lids share their corners
+        for end in (0, -1):
+            rows[k, end] = rim[end] + (EYE - rim[end]) * (0.05 + 0.05 * k)
+    return rows
+
+
+def inside_lips(rim: np.ndarray, sign: float) -> np.ndarray:
+    """[LIP_ROWS, K, 3] rows behind a lip's rim [K, 3], middle to corner: back over the teeth, then up or down."""
+    u = np.linspace(0, 1, len(rim))
+    taper = np.maximum(1 - u**3, 0) ** 0.6
+    back = np.array([2.0, 4.5, 6.5, 7.5])[:, None] * (0.55 + 0.45 * taper)
+    lift = np.array([0.1, 1.0, 4.0, 9.0])[:, None] * taper
+    rows = np.repeat(rim[None], LIP_ROWS, 0)
+    rows[..., 2] -= back
+    rows[..., 1] += sign * lift
+    rows[..., 0] *= 1 - 0.02 * np.arange(1, LIP_ROWS + 1)[:, None]
+    return rows
+
+
+def pouch(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    """[Q, K, 3] the mouth's lining from behind the upper lip over the palate to the back and under the tongue."""
+    t = np.linspace(0, 1, 13)[:, None, None]
+    middle = 0.5 * (upper + lower) - [0, 1.0, 0]
+    half = 0.5 * (upper - lower)
+    angle = np.pi * t
+    tall = half * np.cos(angle) * (1 + 0.35 * np.sin(angle))
+    deep = 46 * np.sin(angle) ** 0.6 * np.array([0, 0, 1.0])
+    line = (1 - t) * upper + t * lower
+    rows = middle * 0 + middle + tall - deep
+    rows[0], rows[-1] = line[0], line[-1]
+    rows[..., 0] = line[..., 0] * (1 + 0.18 * np.sin(angle[..., 0]))
+    return rows
+
+
+# Heights in the UV atlas of the bands between landmark lines, and of the openings, in parts of the island.
+BANDS = (0, 3, 8, 5, 5, 0, 4, 11, 4.5, 5, 0, 5, 7, 5, 6, 7)
+EYE_HOLE, MOUTH_HOLE = 8.0, 8.5
+
+
+def skin_uv(theta: np.ndarray) -> np.ndarray:
+    """[R, C, 2] in [0.5, 1] x [0, 1]: rows and columns with the openings drawn apart, so that no cell bridges them."""
+    weight = np.where(np.arange(len(theta) - 1) < OUTER_COLUMN + 12, 1.0, 0.8)
+    u = np.concatenate([[0], np.cumsum(weight)])
+    u = 0.5 + 0.5 * u / u[-1]
+    total = sum(BANDS) + EYE_HOLE + MOUTH_HOLE
+    column = np.arange(len(theta))
+    e = np.clip((column - CORNER_COLUMN) / (OUTER_COLUMN - CORNER_COLUMN), 0, 1)
+    eye = EYE_HOLE / 2 * np.sin(np.pi * e) ** 0.5
+    mouth = MOUTH_HOLE / 2 * np.maximum(1 - (column / CORNER_COLUMN) ** 4, 0) ** 0.5
+    lines, depth = [], 0.0
+    for (key, _, _), band in zip(KEYS, BANDS, strict=True):
+        depth += band + {"lower_lid": EYE_HOLE, "lower_lip": MOUTH_HOLE}.get(key, 0)
+        line = np.full(len(theta), depth)
+        line += {"upper_lid": EYE_HOLE / 2 - eye, "lower_lid": eye - EYE_HOLE / 2}.get(key, 0)
+        line += {"upper_lip": MOUTH_HOLE / 2 - mouth, "lower_lip": mouth - MOUTH_HOLE / 2}.get(key, 0)
+        lines.append(line)
+    rows = [lines[0][None]]
+    for k in range(1, len(KEYS)):
+        t = np.arange(1, KEYS[k][1] + 1)[:, None] / KEYS[k][1]
+        rows.append((1 - t) * lines[k - 1] + t * lines[k])
+    v = 1 - np.concatenate(rows) / total
+    return np.stack([np.broadcast_to(u, v.shape), v], -1)
+
+
+def build_skin() -> tuple[Part, Part]:
+    """The skin with the insides of lids and lips, and the mouth's pouch, which shares its first and last row's places.
+
+    Marks of the skin: `row` and `column` of the main grid (rows inside lids and lips carry their rim's row),
+    `depth` 0 on the outside, 1.. for rows behind a rim.
+    """
+    bare, theta = skin_grid()
+    points = lip_relief(bare, theta)
+    rows, columns = theta.size * 0 + len(points), len(theta)
+    uv = skin_uv(theta)
+    ids = np.arange(rows * columns).reshape(rows, columns)
+    eye = (row_of("upper_lid"), row_of("lower_lid"))
+    lips = (row_of("upper_lip"), row_of("lower_lip"))
+    eye_columns, lip_columns = np.arange(CORNER_COLUMN, OUTER_COLUMN + 1), np.arange(0, CORNER_COLUMN + 1)
+    for (above, below), inner in ((eye, eye_columns[1:-1]), (lips, lip_columns[:-1])):
+        shared = np.setdiff1d(np.arange(columns), inner)
+        ids[below, shared] = ids[above, shared]
+        points[below, shared] = points[above, shared]
+    cloud, marks = [points.reshape(-1, 3)], [np.stack([*np.indices((rows, columns)), np.zeros((rows, columns), int)], -1).reshape(-1, 3)]
+    grids = [Grid(ids, uv, (eye[0], lips[0]))]
+    count = rows * columns
+    strips = {}
+    for name, row, cols, sign, make in (
+        ("upper_lid", eye[0], eye_columns, 1, inside_lids),
+        ("lower_lid", eye[1], eye_columns, -1, inside_lids),
+        ("upper_lip", lips[0], lip_columns, 1, inside_lips),
+        ("lower_lip", lips[1], lip_columns, -1, inside_lips),
+    ):
+        strip = make(points[row, cols], sign)
+        n = len(strip)
+        strip_ids = count + np.arange(n * len(cols)).reshape(n, len(cols))
+        count += strip_ids.size
+        cloud.append(strip.reshape(-1, 3))
+        marks.append(np.stack(np.broadcast_arrays(row, cols, np.arange(1, n + 1)[:, None]), -1).reshape(-1, 3))
+        ends = (0, -1) if "lid" in name else (-1,)
+        if sign < 0:
+            for end in ends:
+                strip_ids[:, end] = strips[name.replace("lower", "upper")][1:, end]
+        full = np.concatenate([ids[row, cols][None], strip_ids])
+        strips[name] = full
+        toward = (uv[eye if "lid" in name else lips, :][:, cols]).mean(0)
+        share = 0.32 * np.arange(n + 1)[:, None, None] / n
+        strip_uv = (1 - share) * uv[row, cols] + share * toward
+        grids.append(Grid(full if sign > 0 else full[::-1], strip_uv if sign > 0 else strip_uv[::-1]))
+    cloud, marks = np.concatenate(cloud), np.concatenate(marks)
+    used = np.zeros(len(cloud), bool)
+    used[np.concatenate([g.ids.ravel() for g in grids])] = True
+    new = np.cumsum(used) - 1
+    grids = tuple(Grid(new[g.ids], g.uv, g.holes) for g in grids)
+    lining = pouch(cloud[strips["upper_lip"][-1]], cloud[strips["lower_lip"][-1]])
+    cloud, marks = cloud[used], marks[used]
+    named = {"row": marks[:, 0], "column": marks[:, 1], "depth": marks[:, 2]}
+    return Part("skin", cloud, grids, np.zeros_like(cloud), named), pouch_part(lining)
+
+
+def pouch_part(lining: np.ndarray) -> Part:
+    rows, columns = lining.shape[:2]
+    ids = np.arange(rows * columns).reshape(rows, columns)
+    u, v = np.meshgrid(np.linspace(0.5, 1, columns), np.linspace(1, 0, rows))
+    marks = {"row": np.repeat(np.linspace(0, 1, rows), columns), "column": np.tile(np.arange(columns), rows)}
+    return Part("mouth", lining.reshape(-1, 3), (Grid(ids, np.stack([u, v], -1)),), np.zeros((ids.size, 3)), marks)
