@@ -23,7 +23,7 @@ class Bust:
     Args:
         vertices: float64[R L, 3] m.
         faces: int32[F, 3] into edge (0..L-1) followed by the rings (L..).
-        uvs: float64[T, 2] in [0, 1]; the strip is cut open at the loop's first vertex.
+        uvs: float64[T, 2] in [0, 1]; rings along u, cut open at the loop's first vertex.
         uv_faces: int32[F, 3].
         follow: float64[R L] how much of its edge vertex's own motion each vertex takes over (the rest is the mean's).
     """
@@ -73,7 +73,7 @@ def _strip(length: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         c, d = b + width, a + width
         return np.stack([np.stack([a, d, c], -1), np.stack([a, c, b], -1)], 1).reshape(-1, 3).astype(np.int32)
 
-    u, v = np.meshgrid(np.arange(length + 1) / length, 1 - np.arange(N_RINGS + 1) / N_RINGS)
+    v, u = np.meshgrid(np.arange(length + 1) / length, np.arange(N_RINGS + 1) / N_RINGS)
     return (
         quads(length, (step + 1) % length),
         np.stack([u.ravel(), v.ravel()], -1),

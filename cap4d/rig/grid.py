@@ -14,6 +14,7 @@ import numpy as np
 
 from cap4d import _core
 from cap4d.errors import ArgumentError
+from cap4d.rig.atlas import islands
 from cap4d.rig.head import HeadRig, Subject
 from cap4d.rotation import Array, namespace
 
@@ -84,14 +85,14 @@ def build_grid(rig: HeadRig, size: int = 128) -> UvGrid:
     valid = seen >= 0
     pixels = np.argwhere(valid)
     face = seen[valid]
-    islands = np.full(seen.shape, -1)
-    islands[valid] = _uv_islands(rig)[rig.uv_faces[face, 0]]
+    island = np.full(seen.shape, -1)
+    island[valid] = islands(rig.uv_faces, len(rig.uvs))[rig.uv_faces[face, 0]]
     deformable = np.zeros(len(rig.template), bool)
     deformable[rig.regions["deformable"]] = True
     return UvGrid(
         size=size,
         pixels=pixels.astype(np.int16),
-        faces=_grid_faces(islands),
+        faces=_grid_faces(island),
         deformable=deformable[rig.faces[face]].all(1),
         vertices=rig.faces[face].astype(np.int32),
         bary=bary[valid].astype(np.float32),
@@ -110,29 +111,15 @@ def _rasterize_uvs(rig: HeadRig, size: int) -> tuple[np.ndarray, np.ndarray]:
     return _core.rasterize_mesh(xyz, np.ascontiguousarray(rig.uv_faces, np.int32), size, size, "clockwise")
 
 
-def _grid_faces(islands: np.ndarray) -> np.ndarray:
+def _grid_faces(island: np.ndarray) -> np.ndarray:
     """int32[M, 3]: two triangles per 2x2 cell, where all corners are on one island; columns outer, rows inner (fact 18)."""
-    valid = islands >= 0
+    valid = island >= 0
     index = np.cumsum(valid).reshape(valid.shape) - 1
-    rows, columns = np.arange(islands.shape[0] - 1), np.arange(islands.shape[1] - 1)
+    rows, columns = np.arange(island.shape[0] - 1), np.arange(island.shape[1] - 1)
     column, row = (x.ravel() for x in np.meshgrid(columns, rows, indexing="ij"))
     upper = [(row, column), (row + 1, column), (row + 1, column + 1)]
     lower = [(row, column), (row + 1, column + 1), (row, column + 1)]
     triangles = np.stack([np.stack([index[at] for at in t], -1) for t in (upper, lower)], 1)
-    corners = np.stack([np.stack([islands[at] for at in t], -1) for t in (upper, lower)], 1)
+    corners = np.stack([np.stack([island[at] for at in t], -1) for t in (upper, lower)], 1)
     kept = (corners >= 0).all(-1) & (corners == corners[..., :1]).all(-1)
     return triangles[kept].astype(np.int32)
-
-
-def _uv_islands(rig: HeadRig) -> np.ndarray:
-    """int[T] a label per connected piece of the texture: the smallest texture vertex in it."""
-    label = np.arange(len(rig.uvs))
-    while True:
-        smallest = label.copy()
-        lowest = label[rig.uv_faces].min(1)
-        for corner in range(3):
-            np.minimum.at(smallest, rig.uv_faces[:, corner], lowest)
-        smallest = smallest[smallest]  # pointer jumping: halves the number of rounds
-        if (smallest == label).all():
-            return label
-        label = smallest

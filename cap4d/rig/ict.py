@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from cap4d.rig import ict_paint as paint
-from cap4d.rig.atlas import enlarge_busy, place, weld
+from cap4d.rig.atlas import add_skirts, enlarge_busy, islands, place, unmirror, weld
 from cap4d.rig.bust import grow_bust, open_edge
 from cap4d.rig.head import HeadRig
 from cap4d.rig.ict_source import IctModel, read_ict
@@ -46,17 +46,20 @@ LANDMARKS = np.array(
 
 # Where each tile lies in the atlas, in pixels of a 128 grid: u0, v0, u1, v1. Most of it is face.
 BOXES = {
-    "face": (0, 42, 88, 128),
-    "head_and_neck": (0, 0, 62, 42),
-    "bust": (62, 0, 128, 42),
+    "face": (0, 48, 88, 128),
+    "head_and_neck": (0, 0, 88, 48),
+    "bust": (88.495, 0.495, 127.6, 61.505),  # its ends, which meet at the back, lie on pixel centres
     "eye_left": (88, 108, 108, 128),
     "eye_right": (108, 108, 128, 128),
-    "teeth": (88, 74, 116, 108),
-    "mouth_socket": (116, 88, 128, 108),
-    "eye_socket_left": (116, 81, 128, 88),
-    "eye_socket_right": (116, 74, 128, 81),
-    "gums": (88, 42, 128, 74),
+    "teeth": (88, 82, 114, 108),
+    "mouth_socket": (114, 90, 128, 108),
+    "eye_socket_left": (114, 82, 121, 90),
+    "eye_socket_right": (121, 82, 128, 90),
+    "gums": (88, 62, 128, 82),
 }
+EYE_R, EYE_L = slice(36, 42), slice(42, 48)  # in LANDMARKS
+SKIRT = 0.65 / 128  # of the atlas
+LID_WEIGHT = 4.0  # of a vertex at the lids, beside one elsewhere
 FACE_WARP = 0.5  # share of the face tile's room given out by vertex density
 
 SKULL_BASE_CM = np.array(
@@ -82,7 +85,7 @@ def import_ict(path: Path) -> HeadRig:
     expression[:, RANGES["eye_left"][0] : N_KEPT] = (
         0  # the joints alone turn the balls, eyeLook* only moves the lids
     )
-    faces, uvs, uv_faces = _mesh(model)
+    faces, uvs, uv_faces, uv_tiles = _mesh(model, points)
 
     skin = faces[(faces < RANGES["eye_sockets"][1]).all(1)]
     edge = open_edge(skin)
@@ -91,7 +94,10 @@ def import_ict(path: Path) -> HeadRig:
     bust_ids = np.concatenate([edge, N_KEPT + np.arange(len(bust.vertices))]).astype(np.int32)
     faces = np.concatenate([faces, bust_ids[bust.faces]])
     uv_faces = np.concatenate([uv_faces, bust.uv_faces + len(uvs)])
-    uvs = np.concatenate([uvs, place(bust.uvs, _box("bust"))])
+    uvs = np.concatenate([uvs, place(bust.uvs, _box("bust"), gutter=0)])
+    outside = (uv_tiles == "face") | (uv_tiles == "head_and_neck")
+    outside = np.append(outside[uv_faces[: -len(bust.faces), 0]], np.ones(len(bust.faces), bool))
+    uvs, uv_faces, faces = add_skirts(uvs, uv_faces, faces, where=outside, width=SKIRT)
 
     weights, regressors = _joints(points)
     template = np.concatenate([points, bust.vertices])
@@ -129,36 +135,54 @@ def _in_range(ids: np.ndarray, part: str) -> np.ndarray:
     return (ids >= RANGES[part][0]) & (ids < RANGES[part][1])
 
 
-def _mesh(model: IctModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles of the parts that are kept, with their tiles moved to their places in the atlas."""
+def _mesh(model: IctModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles of the parts that are kept, their texture in the atlas, and text[T] the tile of each texture vertex."""
     faces, uv_faces = triangulate(model.faces, model.uv_faces)
-    tiles = _tile_of_faces(faces, model.uvs[uv_faces].mean(1))
-    kept = tiles != ""
-    faces, tiles = faces[kept], tiles[kept]
+    parts = _part_of_faces(faces, model.uvs[uv_faces].mean(1))
+    kept = parts >= 0
+    faces, parts = faces[kept], parts[kept]
     uvs, uv_faces = weld(model.uvs, uv_faces[kept], faces)
+    uvs = unmirror(uvs, uv_faces)
+    vertex = np.zeros(len(uvs), int)
+    vertex[uv_faces] = faces
+    tiles = _tile_of_uvs(uvs, uv_faces, parts, points[vertex, 0])
     for tile in np.unique(tiles):
-        ids = np.unique(uv_faces[tiles == tile])
-        uvs[ids] = place(enlarge_busy(uvs[ids] % 1, FACE_WARP) if tile == "face" else uvs[ids], _box(tile))
-    return faces, uvs, uv_faces
+        ids = tiles == tile
+        if tile == "face":
+            uvs[ids] = enlarge_busy(uvs[ids], _importance(points[vertex[ids]], points), strength=FACE_WARP)
+        uvs[ids] = place(uvs[ids], _box(tile))
+    return faces, uvs, uv_faces, tiles
 
 
-def _tile_of_faces(faces: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """text[F] the tile each face lies in, empty for faces that are left out. `centres` [F, 2] are in the model's UVs."""
-    tiles = np.full(len(faces), "", "U20")
-    for part in RANGES:
-        tiles[_in_range(faces, part).all(1)] = part
-    # Where parts meet, the tile is the one the face's texture lies in.
-    u, v = centres.T
-    skin = (faces < RANGES["eye_sockets"][1]).all(1)
-    second = skin & (u > 1)
-    tiles[skin & (u <= 1)] = "face"
-    tiles[second] = "head_and_neck"
-    tiles[second & (u < 1.25) & (v > 0.7)] = "mouth_socket"
-    tiles[second & (u > 1.72) & (v > 0.83)] = "eye_socket_right"
-    tiles[second & (u > 1.855) & (v > 0.83)] = "eye_socket_left"
-    eyes = (tiles == "eye_left") | (tiles == "eye_right")
-    tiles[eyes & (np.hypot(u - 0.5, v - 0.5) > 0.5)] = ""  # the balls' backs
+def _part_of_faces(faces: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """int[F] index into RANGES, or -1 for faces that are left out. `centres` [F, 2] are in the model's UVs."""
+    parts = np.full(len(faces), -1)
+    for index, part in enumerate(RANGES):
+        parts[_in_range(faces[:, 0], part)] = index
+        if part.startswith("eye_") and part != "eye_sockets":
+            back = np.hypot(*(centres - 0.5).T) > 0.5  # the front is a disc in the middle of the tile
+            parts[(parts == index) & back] = -1
+    return parts
+
+
+def _tile_of_uvs(uvs: np.ndarray, uv_faces: np.ndarray, parts: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """text[T] the tile of each texture vertex: the part that most faces of its island belong to; sockets by side."""
+    label = islands(uv_faces, len(uvs))
+    votes = np.zeros((len(uvs), len(RANGES)))
+    np.add.at(votes, (label[uv_faces[:, 0]], parts), 1)
+    votes[(uvs[:, 0] > 1), 0] = 0  # ears lie half in the second tile
+    tiles = np.array(list(RANGES), "U20")[votes.argmax(1)][label]
+    sockets = tiles == "eye_sockets"
+    tiles[sockets] = np.where(x[sockets] > 0, "eye_socket_left", "eye_socket_right")
     return tiles
+
+
+def _importance(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[T] how much room the surroundings of a face vertex deserve: lids most of all."""
+    lids = np.minimum(
+        *(paint.distance_to_line(vertices, points[LANDMARKS[eye]], closed=True) for eye in (EYE_R, EYE_L))
+    )
+    return 1 + LID_WEIGHT * np.exp(-((lids / 0.008) ** 2))
 
 
 def _leaving(points: np.ndarray, faces: np.ndarray, edge: np.ndarray) -> np.ndarray:
