@@ -1,0 +1,87 @@
+"""FlowFace sequences: the `fit.npz` that trackers write and the released CAP4D animates from (facts 41, 46)."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from cap4d.bundle.bundle import Bundle
+from cap4d.drive.clip import Clip
+from cap4d.errors import DataError
+from cap4d.rig.npz import checked, read_npz
+
+MAX_BYTES = 1 << 29  # unpacked
+MAX_FRAMES = 200_000
+DEFAULT_FPS = 24.0  # of a sequence that names none (fact 46)
+FLAME = "flame"  # how the names of FLAME's rigs begin
+FLAME_EXPRESSIONS = 65  # of a sequence that names no rig (fact 3)
+
+
+def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
+    """The expressions, gaze, neck and head pose of a fit.npz, for the avatar whose rig they belong to.
+
+    The identity in it is left aside: expressions are transferred as they are (fact 46). A file without `rig_name` is a
+    FLAME sequence of the released system.
+
+    Raises:
+        DataError: Not sound, or of another rig.
+    """
+    arrays = read_arrays(path)
+    _check_rig(path, arrays, bundle)
+    expr = checked(path, "expr", arrays.get("expr"), kind="float", shape=(None, bundle.n_expressions))
+    frames = len(expr)
+    if not 1 <= frames <= MAX_FRAMES:
+        raise DataError(path, "expr", expected=f"1 to {MAX_FRAMES} frames", found=frames)
+    zeros = np.zeros((frames, 3), np.float32)
+    turns = {name: zeros for name in ("neck_rot", "jaw_rot") if name not in arrays}
+    pose = {name: None for name in ("rot", "tra") if not {"rot", "tra"} <= arrays.keys()}
+    for name in {"eye_rot", "neck_rot", "jaw_rot", "rot", "tra"} - turns.keys() - pose.keys():
+        value = checked(path, name, arrays.get(name), kind="float", shape=(frames, 3))
+        turns[name] = value.astype(np.float32)
+    return Clip(bundle.rig_name, fps or _fps(path, arrays), expr.astype(np.float32), **turns, **pose)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an .npz of bounded size; see `rig.npz.read_npz`."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+        if size > MAX_BYTES:
+            raise DataError(path, "size", expected=f"at most {MAX_BYTES} bytes unpacked", found=size)
+        return read_npz(path)
+    except FileNotFoundError as error:
+        raise DataError(path, "file", expected="an .npz archive", found="no such file") from error
+    except BROKEN_ARCHIVE as error:
+        raise DataError(path, "archive", expected="an .npz of plain arrays", found=error) from error
+
+
+BROKEN_ARCHIVE = (
+    *(OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError),
+    *(MemoryError, OverflowError, SyntaxError, zipfile.BadZipFile, zlib.error),
+)
+"""What NumPy and zipfile raise on files that are cut, corrupt, encrypted, or hold something else."""
+
+
+def _check_rig(path: Path, arrays: dict[str, np.ndarray], bundle: Bundle) -> None:
+    if "rig_name" not in arrays:
+        if not (bundle.rig_name.startswith(FLAME) and bundle.n_expressions == FLAME_EXPRESSIONS):
+            found = f"none, so FLAME with {FLAME_EXPRESSIONS} expressions"
+            raise DataError(path, "rig_name", expected=repr(bundle.rig_name), found=found)
+        return
+    name = str(checked(path, "rig_name", arrays["rig_name"], kind="text", shape=()))
+    if name != bundle.rig_name:
+        raise DataError(path, "rig_name", expected=repr(bundle.rig_name), found=repr(name[:64]))
+
+
+def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
+    value = arrays.get("fps")
+    if value is None:
+        return DEFAULT_FPS
+    if value.size != 1 or value.dtype.kind not in "fiu" or not 0 < float(value.reshape(())) <= 1000:
+        raise DataError(
+            path, "fps", expected="one number in (0, 1000]", found=f"{value.dtype}{list(value.shape)}"
+        )
+    return float(value.reshape(()))

@@ -1,0 +1,61 @@
+"""What `--drive` names, opened: every source of expressions becomes a Clip in the avatar's own expression space."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from cap4d.bundle.bundle import Bundle
+from cap4d.drive.clip import Clip
+from cap4d.drive.fit import read_fit
+from cap4d.drive.retarget import Retargeter
+from cap4d.drive.vertices import VERTEX_FPS, expected_vertices, read_template, read_vertices
+from cap4d.errors import ArgumentError
+
+log = logging.getLogger(__name__)
+
+SOURCES = "a fit.npz, or vertices in an .npy"
+
+
+def open_source(
+    spec: str | None, bundle: Bundle, *, template: Path | None = None, fps: float | None = None
+) -> Clip:
+    """Opens a source of expressions for an avatar.
+
+    Args:
+        spec: None, the avatar's idle clip; `*.npz`, a FlowFace sequence (facts 41, 46); `*.npy`, vertices as
+            CodeTalker and VOCA write them.
+        bundle: The avatar.
+        template: Neutral vertices of an `.npy` (`.npy`, `.npz` with key `template`, or `.obj`); without it the first
+            frame is taken for neutral.
+        fps: Frames per second, overriding what the source says.
+    Raises:
+        ArgumentError: No such kind of source.
+        DataError: The file is not sound, or holds the expressions or the vertices of another rig.
+    """
+    if fps is not None and not 0 < fps <= 1000:
+        raise ArgumentError(f"fps: expected a number in (0, 1000], got {fps}")
+    if spec is None:
+        return bundle.idle
+    path = Path(spec)
+    if path.suffix == ".npz":
+        return read_fit(path, bundle, fps=fps)
+    if path.suffix == ".npy":
+        return _vertex_clip(path, bundle, template, fps)
+    raise ArgumentError(f"drive: expected {SOURCES}, got {spec}")
+
+
+def _vertex_clip(path: Path, bundle: Bundle, template: Path | None, fps: float | None) -> Clip:
+    count = expected_vertices(bundle)
+    vertices = read_vertices(path, count)
+    if template is None:
+        log.warning("%s: no template given: its first frame is taken for the neutral face", path)
+        neutral = vertices[0]
+    else:
+        neutral = read_template(template, count)
+    found = Retargeter(bundle, count)(vertices, neutral)
+    log.info(
+        "%s: %d frames; %.3f mm of motion left over (root mean square; worst frame %.3f mm)",
+        *(path, len(vertices), float((found.residual_mm**2).mean() ** 0.5), float(found.residual_mm.max())),
+    )
+    return found.clip(fps or VERTEX_FPS)

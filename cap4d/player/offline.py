@@ -1,0 +1,239 @@
+"""Avatar + clip + camera path -> pictures, as fast as the machine goes; times per stage beside them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cap4d.atomic import replacing
+from cap4d.camera import Camera
+from cap4d.drive.clip import Clip, Frame
+from cap4d.drive.sample import sample
+from cap4d.drive.source import open_source
+from cap4d.errors import ArgumentError
+from cap4d.player.avatar import Avatar
+from cap4d.player.camera_path import CameraPath, camera_path
+from cap4d.player.stages import peak_memory_mb
+from cap4d.player.video import VideoWriter
+
+log = logging.getLogger(__name__)
+
+WHITE = (1.0, 1.0, 1.0)
+PROGRESS_SECONDS = 2.0  # between lines of progress
+STATS_SCHEMA = 1
+
+Draw = Callable[[Avatar, Frame, Camera], np.ndarray]
+"""(avatar, frame, camera) -> uint8[H, W, 3 | 4], composited. A backend; it times its stages in `avatar.stages`."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """What a render comes to.
+
+    Args:
+        path: `*.mp4`, `*.png` or `frame_%04d.png`; None draws without writing.
+        frames: How many; None is the clip, once.
+        fps: Of the pictures; None is the clip's own.
+        size: (width, height) px; None is the camera's.
+        stats: JSON file for the times, or None.
+    """
+
+    path: str | Path | None
+    frames: int | None = None
+    fps: float | None = None
+    size: tuple[int, int] | None = None
+    stats: Path | None = None
+
+
+def draw_on_cpu(avatar: Avatar, frame: Frame, camera: Camera) -> np.ndarray:
+    """The CPU backend, on white."""
+    return avatar.draw(frame, camera, background=WHITE)
+
+
+def render_clip(
+    avatar: Avatar,
+    clip: Clip,
+    path: CameraPath,
+    *,
+    frames: int | None = None,
+    fps: float | None = None,
+    draw: Draw = draw_on_cpu,
+) -> Iterator[np.ndarray]:
+    """Draws a clip, frame by frame.
+
+    Args:
+        clip: Expressions of the avatar's own rig; it starts again at its end.
+        path: See `camera_path`.
+        frames: How many pictures; None is the clip, once.
+        fps: Pictures per second; None is the clip's own rate, and another rate interpolates.
+        draw: The backend.
+    Yields:
+        uint8[H, W, 3] sRGB.
+    Raises:
+        ArgumentError: The clip is another rig's.
+    """
+    avatar.check_rig(clip.rig_name)
+    fps = fps or clip.fps
+    for index in range(frame_count(clip, frames, fps)):
+        start = time.perf_counter()
+        frame = sample(clip, index / fps)
+        image = draw(avatar, frame, path(index, frame))
+        avatar.stages.add("frame", time.perf_counter() - start)
+        yield np.ascontiguousarray(image[..., :3])
+
+
+def frame_count(clip: Clip, frames: int | None, fps: float) -> int:
+    """How many pictures a render has.
+
+    Raises:
+        ArgumentError: Less than one.
+    """
+    count = max(1, round(clip.duration * fps)) if frames is None else frames
+    if count < 1:
+        raise ArgumentError(f"frames: expected at least 1, got {count}")
+    return count
+
+
+def render_to(
+    avatar: Avatar,
+    clip: Clip,
+    camera: str,
+    output: Output,
+    *,
+    draw: Draw = draw_on_cpu,
+    backend: str = "cpu",
+) -> dict[str, Any]:
+    """Draws a clip into a file and returns (and writes, if asked) the statistics.
+
+    Args:
+        camera: `static`, `orbit` or a file, see `camera_path`.
+        backend: Name of `draw`, for the statistics.
+    Raises:
+        ArgumentError, DataError: Before anything is written.
+    """
+    fps = output.fps or clip.fps
+    path = camera_path(camera, avatar.camera, head_centre(avatar), fps=fps, size=output.size)
+    total = frame_count(clip, output.frames, fps)
+    images = render_clip(avatar, clip, path, frames=total, fps=fps, draw=draw)
+    first = next(images)
+    avatar.stages.clear()  # the first frame loads what the others find loaded
+    start = shown = time.perf_counter()
+    with VideoWriter(output.path, fps=fps) if output.path is not None else _Nowhere() as writer:
+        for done, image in enumerate(_chain(first, images), 1):
+            with avatar.stages.time("write"):
+                writer.write(image)
+            if time.perf_counter() - shown > PROGRESS_SECONDS:
+                shown = time.perf_counter()
+                left = (shown - start) / done * (total - done)
+                log.info("frame %d of %d, %.0f s left", done, total, left)
+    seconds = time.perf_counter() - start
+    stats = statistics(avatar, total, seconds, size=(first.shape[1], first.shape[0]), backend=backend)
+    if output.stats is not None:
+        write_stats(output.stats, stats)
+    return stats
+
+
+def render_file(
+    avatar: Path,
+    output: str | Path,
+    *,
+    drive: str | None = None,
+    template: Path | None = None,
+    fps: float | None = None,
+    camera: str = "static",
+    size: str | None = None,
+    frames: int | None = None,
+    stats: Path | None = None,
+) -> dict[str, Any]:
+    """`cap4d render`: see `render_to`; `drive`, `template` and `fps` are `open_source`'s, `size` is `WxH`."""
+    player = Avatar.load(avatar)
+    clip = open_source(drive, player.bundle, template=template, fps=fps)
+    wanted = Output(output, frames=frames, size=None if size is None else parse_size(size), stats=stats)
+    found = render_to(player, clip, camera, wanted)
+    log.info("%s: %d frames, %.1f fps", output, found["frames"], found["fps"])
+    return found
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """`512x384` -> (512, 384)
+
+    Raises:
+        ArgumentError: Not two numbers of 1 to 16384.
+    """
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and all(1 <= int(n) <= 16384 for n in (width, height))):
+        raise ArgumentError(f"size: expected WIDTHxHEIGHT in px, got {text}")
+    return int(width), int(height)
+
+
+def head_centre(avatar: Avatar) -> np.ndarray:
+    """[3] m the middle of what deforms, or of everything: what an orbit turns around."""
+    points = avatar.vertices(np.zeros(avatar.bundle.n_expressions, np.float32))
+    if avatar.bundle.grid.deformable.any():
+        points = points[avatar.bundle.grid.deformable]
+    return (points.min(0) + points.max(0)).astype(np.float64) / 2
+
+
+def statistics(
+    avatar: Avatar,
+    frames: int,
+    seconds: float,
+    *,
+    size: tuple[int, int],
+    backend: str,
+    dropped: int = 0,
+    late: int = 0,
+) -> dict[str, Any]:
+    """What `--stats` writes; `stages` holds median, 95th and 99th percentile per stage, ms."""
+    return {
+        "schema": STATS_SCHEMA,
+        "backend": backend,
+        "deformer": "off" if avatar.deformer is None else "full",
+        "gaussians": len(avatar.bundle),
+        "width": size[0],
+        "height": size[1],
+        "frames": frames,
+        "seconds": round(seconds, 3),
+        "fps": round(frames / seconds, 2) if seconds > 0 else 0.0,
+        "dropped": dropped,
+        "late": late,
+        "memory_mb": round(peak_memory_mb(), 1),
+        "stages": avatar.stages.report(),
+    }
+
+
+def write_stats(path: Path, stats: dict[str, Any]) -> None:
+    """Writes the statistics as JSON, through a temporary file.
+
+    Raises:
+        ArgumentError: Its folder does not exist.
+    """
+    if not path.parent.is_dir():
+        raise ArgumentError(f"stats: the folder of {path} does not exist")
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(stats, indent=1) + "\n")
+
+
+class _Nowhere:
+    """A writer that keeps nothing."""
+
+    def __enter__(self) -> _Nowhere:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def write(self, image: np.ndarray) -> None:
+        pass
+
+
+def _chain(first: np.ndarray, rest: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    yield first
+    yield from rest
