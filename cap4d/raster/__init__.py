@@ -1,1 +1,8 @@
-"""Differentiable splatting behind one call."""
+"""Differentiable splatting in torch: one call, three backends with one meaning.
+
+`cpu` is the tiled C++ renderer, `gsplat` its CUDA counterpart, `reference` the readable float64 form that both are tested against.
+"""
+
+from cap4d.raster.rasterize import Rasterized, rasterize
+
+__all__ = ["Rasterized", "rasterize"]

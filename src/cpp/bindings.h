@@ -3,5 +3,8 @@
 #include <pybind11/pybind11.h>
 
 namespace cap4d {
+void register_bind(pybind11::module_& m);
 void register_mesh(pybind11::module_& m);
+void register_render(pybind11::module_& m);
+void register_sort(pybind11::module_& m);
 }  // namespace cap4d

@@ -116,7 +116,8 @@ void parallel_for(std::size_t n, std::size_t grain, int threads, const std::func
     for (std::size_t begin = 0; begin < n; begin += grain) body(begin, std::min(n, begin + grain));
     return;
   }
-  Job job{n, grain, &body};
+  Job job;
+  job.n = n, job.grain = grain, job.body = &body;
   pool().run(job, helpers);
   if (job.error) std::rethrow_exception(job.error);
 }

@@ -1,0 +1,218 @@
+"""Splatting as one reads it: float64, every Gaussian at every pixel, gradients by autograd. For small pictures and for tests.
+
+The stages have the names and the order of src/cpp: `project`, `eval_sh`, `composite`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cap4d.camera import NEAR, Camera
+from cap4d.raster.rasterize import Rasterized
+from cap4d.rotation import quat_to_rotmat
+
+EPS2D = 0.3  # px^2; these constants are those of src/cpp/constants.h, where each has its provenance
+JACOBIAN_MARGIN = 0.3
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4
+QUAT_MIN = 1e-12
+RADIUS_SIGMAS = 3.0
+
+PAIRS_AT_ONCE = 1 << 22
+"""Pixel-Gaussian pairs held in memory together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """V Gaussians that may be seen, near to far.
+
+    Args:
+        ids: int64[V] which of the N.
+        means2d: [V, 2] px. conics: [V, 3] 1/px^2: a, b, c of exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2). depths: [V] m.
+        radii: int32[V] px.
+    """
+
+    ids: Tensor
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    radii: Tensor
+
+
+def rasterize_reference(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    *,
+    camera: Camera,
+    background: tuple[float, ...] | None,
+    sh_degree: int,
+    smooth_cutoff: float = 0.0,
+) -> Rasterized:
+    """`rasterize`, readable. The arguments are those of `rasterize`, checked; computes and returns float64.
+
+    Args:
+        smooth_cutoff: 0 is the real thing: contributions below 1/255 are skipped, a pixel ends at transmittance 1e-4 and alpha is
+            clamped at 0.99. Positive: a twin without steps and kinks for finite differences, in which contributions fade in around
+            1/255 over this share of it, pixels never end, and alpha is 0.99 times the opacity times the density.
+    """
+    gaussians = tuple(x.double() for x in (means, quats, scales, opacities, sh))
+    keep = drawable(*gaussians[:4], gaussians[4][:, : (sh_degree + 1) ** 2], camera)
+    means, quats, scales, opacities, sh = (x[keep] for x in gaussians)
+    projected = project(means, quats, scales, opacities, camera=camera)
+    ids = projected.ids
+    colors = eval_sh(sh[ids], means[ids] - means.new_tensor(camera.position), sh_degree)
+    means2d = projected.means2d
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    rgb, alpha, depth = composite(
+        means2d, projected.conics, opacities[ids], colors, projected.depths, camera=camera, smooth_cutoff=smooth_cutoff
+    )
+    if background is not None:
+        rgb = rgb + (1 - alpha)[..., None] * rgb.new_tensor(background)
+    depth = torch.where(alpha > 0, depth / torch.where(alpha > 0, alpha, 1), 0)
+    all_radii = torch.zeros(len(keep), dtype=torch.int32)
+    all_radii[keep.nonzero()[:, 0][ids]] = projected.radii
+    return Rasterized(rgb, alpha, depth, _scattered(means2d, keep.nonzero()[:, 0][ids], len(keep)), all_radii)
+
+
+def drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, camera: Camera) -> Tensor:
+    """bool[N]: finite in every field, in front of the camera, and not too faint to see."""
+    depths = means @ means.new_tensor(camera.viewmat[2, :3]) + camera.viewmat[2, 3]
+    fields = (means, quats, scales, opacities[:, None], sh.flatten(1))
+    finite = torch.stack([torch.isfinite(x.detach()).all(1) for x in fields]).all(0)
+    return finite & (depths.detach() >= NEAR) & (opacities.detach() >= ALPHA_MIN)
+
+
+def project(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, *, camera: Camera, eps2d: float = EPS2D) -> Projected:
+    """Projects Gaussians onto the image plane with the EWA approximation.
+
+    Zwicker et al. 2002, eq. 31; the Jacobian is clamped at 1.3x the field of view (as in gsplat).
+
+    Args:
+        means, quats, scales, opacities: drawable Gaussians in world space, m.
+        eps2d: Low-pass variance added to both image axes, px^2.
+    Returns:
+        Those whose outline (alpha = 1/255) meets the image, near to far; equal depths in their given order.
+    """
+    rotation, translation = (means.new_tensor(camera.viewmat[:3, i]) for i in (slice(3), 3))
+    focal, centre = means.new_tensor(camera.K.diagonal()[:2]), means.new_tensor(camera.K[:2, 2])
+    size = means.new_tensor([camera.width, camera.height])
+    view = means @ rotation.T + translation
+    x, z = view[:, :2], view[:, 2:]
+    means2d = focal * x / z + centre
+    margin = JACOBIAN_MARGIN * size / (2 * focal)
+    clamped = (x / z).clamp(-centre / focal - margin, (size - centre) / focal + margin)
+    # J = [f / z, 0, -f x / z^2; 0, f / z, -f y / z^2], applied to the rows of the rotation.
+    jacobian_view = (focal / z)[..., None] * (rotation[:2] - clamped[..., None] * rotation[2])
+    unit = torch.where(quats.abs().amax(1, keepdim=True) > QUAT_MIN, quats, quats.new_tensor([1.0, 0, 0, 0]))
+    root = jacobian_view @ (quat_to_rotmat(unit) * scales[:, None])
+    covariance = root @ root.mT + eps2d * torch.eye(2, dtype=means.dtype)
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    det = torch.linalg.cross(root[:, 0], root[:, 1]).square().sum(-1) + eps2d * (xx + yy) - eps2d**2
+    conics = torch.stack([yy, -xy, xx], 1) / det[:, None]
+    with torch.no_grad():
+        reach = (2 * torch.log(opacities / ALPHA_MIN))[:, None] * torch.stack([xx, yy], 1)
+        edge = reach.sqrt()
+        seen = ((means2d + edge > 0) & (means2d - edge < size)).all(1) & torch.isfinite(conics).all(1)
+        ids = seen.nonzero()[:, 0]
+        ids = ids[torch.argsort(z[ids, 0], stable=True)]
+        longest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+        radii = (RADIUS_SIGMAS * longest.sqrt()).ceil().clamp(max=1e9).int()
+    return Projected(ids, means2d[ids], conics[ids], z[ids, 0], radii[ids])
+
+
+def eval_sh(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Colours [V, 3] = max(0, 0.5 + SH) of coefficients [V, S, 3] seen along directions [V, 3] (any length), camera to Gaussian."""
+    basis = sh_basis(directions / directions.norm(dim=1, keepdim=True), degree)
+    return ((basis[..., None] * sh[:, : (degree + 1) ** 2]).sum(1) + 0.5).clamp(min=0)
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """[V, (degree + 1)^2] real spherical harmonics of unit directions [V, 3], order and signs of 3DGS."""
+    x, y, z = directions.unbind(1)
+    xx, yy, zz = x * x, y * y, z * z
+    bands = [
+        [0.28209479177387814 * torch.ones_like(x)],
+        [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x],
+        [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ],
+        [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ],
+    ]
+    return torch.stack([b for band in bands[: degree + 1] for b in band], 1)
+
+
+def pixel_alphas(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, *, smooth_cutoff: float = 0.0) -> Tensor:
+    """[P, V] opacity of each Gaussian at pixel centres [P, 2]."""
+    dx, dy = (pixels[:, None] - means2d).unbind(-1)
+    a, b, c = conics.unbind(1)
+    density = torch.exp(-(a * dx * dx + c * dy * dy) / 2 - b * dx * dy)
+    if smooth_cutoff > 0:
+        alphas = ALPHA_MAX * opacities * density
+        return alphas * torch.sigmoid((alphas / ALPHA_MIN - 1) / smooth_cutoff)
+    alphas = (opacities * density).clamp(max=ALPHA_MAX)
+    return torch.where(alphas >= ALPHA_MIN, alphas, 0)
+
+
+def blend_weights(alphas: Tensor, *, stop: bool = True) -> Tensor:
+    """[P, V] share of each Gaussian, near to far, in each pixel: alpha times what those before it let through.
+
+    The Gaussian that would take the transmittance below 1e-4, and all behind it, are left out.
+    """
+    through = torch.cumprod(1 - alphas, 1)
+    before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)
+    return alphas * before * (through >= TRANSMITTANCE_MIN) if stop else alphas * before
+
+
+def composite(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, depths: Tensor, *, camera: Camera, smooth_cutoff: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Premultiplied rgb [H, W, 3], alpha [H, W] and accumulated depth [H, W] of Gaussians that come near to far."""
+    if not len(means2d):
+        empty = means2d.new_zeros(camera.height, camera.width)
+        return empty[..., None].expand(-1, -1, 3), empty, empty
+    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    pixels = torch.stack([x, y], -1).reshape(-1, 2).to(means2d) + 0.5
+    values = torch.cat([colors, torch.ones_like(colors[:, :1]), depths[:, None]], 1)
+    rows = []
+    for block in pixels.split(max(1, PAIRS_AT_ONCE // len(means2d))):
+        alphas = pixel_alphas(means2d, conics, opacities, block, smooth_cutoff=smooth_cutoff)
+        rows.append(blend_weights(alphas, stop=smooth_cutoff == 0) @ values)
+    rgb, alpha, depth = torch.cat(rows).split([3, 1, 1], 1)
+    shape = (camera.height, camera.width)
+    return rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape)
+
+
+def _scattered(means2d: Tensor, ids: Tensor, count: int) -> Tensor:
+    """A [N, 2] leaf whose gradient is filled from the V rows' when those get theirs."""
+    leaf = means2d.new_zeros(count, 2)
+    leaf[ids] = means2d.detach()
+    if means2d.requires_grad:
+        leaf.requires_grad_()
+
+        def collect(v_means2d: Tensor) -> None:
+            grad = torch.zeros_like(leaf)
+            grad[ids] = v_means2d
+            leaf.grad = grad if leaf.grad is None else leaf.grad + grad
+
+        means2d.register_hook(collect)
+    return leaf

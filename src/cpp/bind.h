@@ -1,0 +1,20 @@
+// Gaussians that ride on triangles (GaussianAvatars, Qian et al. 2024; fact 27): local parameters and a posed mesh -> posed Gaussians.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+namespace cap4d {
+
+// What does not change while the mesh moves (not owned). Indices are checked by the caller.
+struct BoundGaussians {
+  std::size_t count, faces_count;
+  const std::int32_t* faces;    // [M, 3]
+  const std::int32_t* binding;  // [N] into faces
+  const float *means, *quats, *log_scales;  // [N, 3] in units of the triangle's size, [N, 4] wxyz, [N, 3]
+};
+
+// means = R (s x) + centre, scales = exp(log_scales) s, quats = q_face (x) normalise(quats).
+// A triangle without area gets some rotation and its own (possibly zero) size; nothing becomes NaN that was not.
+void bind(const float* vertices, const BoundGaussians& bound, int threads, float* means, float* quats, float* scales);
+
+}  // namespace cap4d

@@ -1,0 +1,57 @@
+#include <pybind11/numpy.h>
+
+#include <stdexcept>
+#include <string>
+
+#include "bind.h"
+#include "bindings.h"
+
+namespace py = pybind11;
+
+namespace cap4d {
+namespace {
+
+using FloatArray = py::array_t<float, py::array::c_style>;
+using IntArray = py::array_t<std::int32_t, py::array::c_style>;
+
+void expect_rows(const py::array& a, const char* name, py::ssize_t rows, py::ssize_t columns) {
+  if (a.ndim() != 2 || a.shape(1) != columns || (rows >= 0 && a.shape(0) != rows))
+    throw std::invalid_argument(std::string(name) + ": expected [" + (rows < 0 ? "any" : std::to_string(rows)) + ", " + std::to_string(columns) + "]");
+}
+
+void expect_below(const IntArray& indices, const char* name, py::ssize_t limit) {
+  for (py::ssize_t i = 0; i < indices.size(); ++i)
+    if (indices.data()[i] < 0 || indices.data()[i] >= limit)
+      throw std::invalid_argument(std::string(name) + ": index " + std::to_string(indices.data()[i]) + " is out of range");
+}
+
+py::tuple bind_gaussians(FloatArray vertices, IntArray faces, FloatArray means, FloatArray quats, FloatArray log_scales, IntArray binding,
+                         int threads) {
+  const py::ssize_t n = binding.ndim() == 1 ? binding.shape(0) : -1;
+  if (n < 0) throw std::invalid_argument("binding: expected int32[N]");
+  expect_rows(vertices, "vertices", -1, 3);
+  expect_rows(faces, "faces", -1, 3);
+  expect_rows(means, "means", n, 3);
+  expect_rows(quats, "quats", n, 4);
+  expect_rows(log_scales, "log_scales", n, 3);
+  expect_below(faces, "faces", vertices.shape(0));
+  expect_below(binding, "binding", faces.shape(0));
+  FloatArray out_means({n, py::ssize_t{3}}), out_quats({n, py::ssize_t{4}}), out_scales({n, py::ssize_t{3}});
+  const BoundGaussians bound{static_cast<std::size_t>(n), static_cast<std::size_t>(faces.shape(0)), faces.data(), binding.data(),
+                             means.data(), quats.data(), log_scales.data()};
+  float *m = out_means.mutable_data(), *q = out_quats.mutable_data(), *s = out_scales.mutable_data();
+  {
+    py::gil_scoped_release release;
+    bind(vertices.data(), bound, threads, m, q, s);
+  }
+  return py::make_tuple(out_means, out_quats, out_scales);
+}
+
+}  // namespace
+
+void register_bind(py::module_& m) {
+  m.def("bind", &bind_gaussians, py::arg("vertices").noconvert(), py::arg("faces").noconvert(), py::arg("means").noconvert(),
+        py::arg("quats").noconvert(), py::arg("log_scales").noconvert(), py::arg("binding").noconvert(), py::arg("threads") = 0);
+}
+
+}  // namespace cap4d

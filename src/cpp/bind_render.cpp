@@ -1,0 +1,167 @@
+#include <pybind11/numpy.h>
+#include <pybind11/stl.h>
+
+#include <array>
+#include <cmath>
+#include <optional>
+#include <stdexcept>
+#include <string>
+
+#include "bindings.h"
+#include "constants.h"
+#include "parallel.h"
+#include "render.h"
+
+namespace py = pybind11;
+
+namespace cap4d {
+namespace {
+
+using FloatArray = py::array_t<float, py::array::c_style>;
+using DoubleArray = py::array_t<double, py::array::c_style>;
+using Background = std::optional<std::array<float, 3>>;
+
+std::string describe(const py::array& a) {
+  std::string text = "[";
+  for (py::ssize_t i = 0; i < a.ndim(); ++i) text += (i ? ", " : "") + std::to_string(a.shape(i));
+  return text + "]";
+}
+
+void expect(const py::array& a, const char* name, std::initializer_list<py::ssize_t> shape) {
+  bool same = a.ndim() == static_cast<py::ssize_t>(shape.size());
+  py::ssize_t i = 0;
+  std::string wanted = "[";
+  for (const py::ssize_t size : shape) {
+    same = same && a.shape(i) == size;
+    wanted += (i++ ? ", " : "") + std::to_string(size);
+  }
+  if (!same) throw std::invalid_argument(std::string(name) + ": expected " + wanted + "], got " + describe(a));
+}
+
+struct Inputs {
+  FloatArray means, quats, scales, opacities, sh;
+  GaussiansView view;
+};
+
+Inputs make_inputs(FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh, int sh_degree) {
+  const py::ssize_t n = means.ndim() ? means.shape(0) : 0;
+  if (n >= (py::ssize_t{1} << 31)) throw std::invalid_argument("means: more than 2^31 Gaussians");
+  expect(means, "means", {n, 3});
+  expect(quats, "quats", {n, 4});
+  expect(scales, "scales", {n, 3});
+  expect(opacities, "opacities", {n});
+  const int stored = sh.ndim() == 3 ? static_cast<int>(sh.shape(1)) : 0;
+  if (stored != 1 && stored != 4 && stored != 9 && stored != 16) throw std::invalid_argument("sh: expected [N, 1|4|9|16, 3], got " + describe(sh));
+  expect(sh, "sh", {n, stored, 3});
+  const int degree = stored == 1 ? 0 : stored == 4 ? 1 : stored == 9 ? 2 : 3;
+  if (sh_degree > degree) throw std::invalid_argument("sh_degree: expected at most " + std::to_string(degree) + ", got " + std::to_string(sh_degree));
+  const GaussiansView view{static_cast<std::size_t>(n), stored, sh_degree < 0 ? degree : sh_degree,
+                           means.data(), quats.data(), scales.data(), opacities.data(), sh.data()};
+  return {means, quats, scales, opacities, sh, view};
+}
+
+Camera checked_camera(const DoubleArray& viewmat, const DoubleArray& K, int width, int height) {
+  expect(viewmat, "viewmat", {4, 4});
+  expect(K, "K", {3, 3});
+  if (width < 1 || height < 1 || width > kMaxSide || height > kMaxSide)
+    throw std::invalid_argument("size: expected 1 to " + std::to_string(kMaxSide) + " px a side, got " + std::to_string(width) + "x" + std::to_string(height));
+  for (int i = 0; i < 16; ++i)
+    if (!std::isfinite(viewmat.data()[i])) throw std::invalid_argument("viewmat: expected finite numbers");
+  for (int i = 0; i < 9; ++i)
+    if (!std::isfinite(K.data()[i])) throw std::invalid_argument("K: expected finite numbers");
+  if (!(K.data()[0] > 0) || !(K.data()[4] > 0)) throw std::invalid_argument("K: expected positive focal lengths");
+  return make_camera(viewmat.data(), K.data(), width, height);
+}
+
+struct OwnedImage {
+  FloatArray rgb, alpha, depth;
+  OwnedImage(int height, int width) : rgb({height, width, 3}), alpha({height, width}), depth({height, width}) {}
+  Image view() { return {rgb.mutable_data(), alpha.mutable_data(), depth.mutable_data()}; }
+};
+
+py::tuple render(FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh, DoubleArray viewmat, DoubleArray K,
+                 int width, int height, Background background, int sh_degree, int threads) {
+  const Inputs in = make_inputs(means, quats, scales, opacities, sh, sh_degree);
+  const Camera camera = checked_camera(viewmat, K, width, height);
+  OwnedImage image(height, width);
+  const Image out = image.view();
+  {
+    py::gil_scoped_release release;
+    render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kPlay, threads, out);
+  }
+  return py::make_tuple(image.rgb, image.alpha, image.depth);
+}
+
+py::tuple rasterize(FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh, DoubleArray viewmat, DoubleArray K,
+                    int width, int height, Background background, int sh_degree, int threads) {
+  const Inputs in = make_inputs(means, quats, scales, opacities, sh, sh_degree);
+  const Camera camera = checked_camera(viewmat, K, width, height);
+  OwnedImage image(height, width);
+  const Image out = image.view();
+  auto rendered = std::make_unique<Rendered>();
+  const py::ssize_t n = means.shape(0);
+  FloatArray means2d({n, py::ssize_t{2}});
+  py::array_t<std::int32_t> radii(n);
+  float* xy = means2d.mutable_data();
+  std::int32_t* radius = radii.mutable_data();
+  {
+    py::gil_scoped_release release;
+    *rendered = render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kTrain, threads, out);
+    std::fill_n(xy, 2 * n, 0.0f);
+    std::copy_n(rendered->radii.get(), n, radius);
+    for (std::size_t i = 0; i < rendered->drawn; ++i) {
+      const Splat& s = rendered->splats[i];
+      xy[2 * std::size_t{s.id}] = s.x, xy[2 * std::size_t{s.id} + 1] = s.y;
+    }
+  }
+  return py::make_tuple(image.rgb, image.alpha, image.depth, means2d, radii, py::cast(std::move(rendered)));
+}
+
+py::tuple rasterize_vjp(const Rendered& rendered, FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh,
+                        int sh_degree, FloatArray rgb, FloatArray alpha, FloatArray depth, FloatArray v_rgb, std::optional<FloatArray> v_alpha,
+                        std::optional<FloatArray> v_depth, int threads) {
+  const Inputs in = make_inputs(means, quats, scales, opacities, sh, sh_degree);
+  const py::ssize_t n = means.shape(0), height = rendered.camera.height, width = rendered.camera.width;
+  if (static_cast<std::size_t>(n) != rendered.count) throw std::invalid_argument("means: not the Gaussians of the forward pass");
+  expect(rgb, "rgb", {height, width, 3});
+  expect(alpha, "alpha", {height, width});
+  expect(depth, "depth", {height, width});
+  expect(v_rgb, "v_rgb", {height, width, 3});
+  if (v_alpha) expect(*v_alpha, "v_alpha", {height, width});
+  if (v_depth) expect(*v_depth, "v_depth", {height, width});
+  FloatArray v_means({n, py::ssize_t{3}}), v_quats({n, py::ssize_t{4}}), v_scales({n, py::ssize_t{3}}), v_opacities(n);
+  FloatArray v_sh({n, sh.shape(1), py::ssize_t{3}}), v_means2d({n, py::ssize_t{2}});
+  const Image image{const_cast<float*>(rgb.data()), const_cast<float*>(alpha.data()), const_cast<float*>(depth.data())};
+  const ImageGrad v_image{v_rgb.data(), v_alpha ? v_alpha->data() : nullptr, v_depth ? v_depth->data() : nullptr};
+  const GaussianGrads grads{v_means.mutable_data(), v_quats.mutable_data(), v_scales.mutable_data(),
+                            v_opacities.mutable_data(), v_sh.mutable_data(), v_means2d.mutable_data()};
+  {
+    py::gil_scoped_release release;
+    render_bwd(rendered, in.view, image, v_image, threads, grads);
+  }
+  return py::make_tuple(v_means, v_quats, v_scales, v_opacities, v_sh, v_means2d);
+}
+
+}  // namespace
+
+void register_render(py::module_& m) {
+  py::class_<Rendered>(m, "Rendered", "What the forward pass leaves for the gradient.")
+      .def_property_readonly("drawn", [](const Rendered& r) { return r.drawn; })
+      .def_property_readonly("pairs", [](const Rendered& r) { return r.tiling.count; });
+  const auto means = py::arg("means").noconvert();
+  const auto quats = py::arg("quats").noconvert();
+  const auto scales = py::arg("scales").noconvert();
+  const auto opacities = py::arg("opacities").noconvert();
+  const auto sh = py::arg("sh").noconvert();
+  m.def("render", &render, means, quats, scales, opacities, sh, py::arg("viewmat"), py::arg("K"), py::arg("width"), py::arg("height"),
+        py::arg("background") = py::none(), py::arg("sh_degree") = -1, py::arg("threads") = 0);
+  m.def("rasterize", &rasterize, means, quats, scales, opacities, sh, py::arg("viewmat"), py::arg("K"), py::arg("width"), py::arg("height"),
+        py::arg("background") = py::none(), py::arg("sh_degree") = -1, py::arg("threads") = 0);
+  m.def("rasterize_vjp", &rasterize_vjp, py::arg("rendered"), means, quats, scales, opacities, sh, py::arg("sh_degree"), py::arg("rgb").noconvert(),
+        py::arg("alpha").noconvert(), py::arg("depth").noconvert(), py::arg("v_rgb").noconvert(), py::arg("v_alpha").noconvert(),
+        py::arg("v_depth").noconvert(), py::arg("threads") = 0);
+  m.def("isa", [] { return kernels().isa; });
+  m.def("default_threads", &default_threads);
+}
+
+}  // namespace cap4d

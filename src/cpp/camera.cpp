@@ -1,0 +1,28 @@
+#include "camera.h"
+
+#include "constants.h"
+
+namespace cap4d {
+
+Camera make_camera(const double* viewmat, const double* K, int width, int height) {
+  Camera camera{};
+  for (int i = 0; i < 3; ++i) {
+    double centre = 0;
+    for (int j = 0; j < 3; ++j) {
+      camera.rotation[i][j] = static_cast<float>(viewmat[4 * i + j]);
+      centre -= viewmat[4 * j + i] * viewmat[4 * j + 3];
+    }
+    camera.position[i] = static_cast<float>(centre);
+    camera.translation[i] = static_cast<float>(viewmat[4 * i + 3]);
+  }
+  const double fx = K[0], fy = K[4], cx = K[2], cy = K[5];
+  const double margin_x = kJacobianMargin * 0.5 * width / fx, margin_y = kJacobianMargin * 0.5 * height / fy;
+  camera.fx = static_cast<float>(fx), camera.fy = static_cast<float>(fy);
+  camera.cx = static_cast<float>(cx), camera.cy = static_cast<float>(cy);
+  camera.x_min = static_cast<float>(-cx / fx - margin_x), camera.x_max = static_cast<float>((width - cx) / fx + margin_x);
+  camera.y_min = static_cast<float>(-cy / fy - margin_y), camera.y_max = static_cast<float>((height - cy) / fy + margin_y);
+  camera.width = width, camera.height = height;
+  return camera;
+}
+
+}  // namespace cap4d

@@ -1,0 +1,40 @@
+#include "kernels.h"
+
+#include <cstdlib>
+#include <cstring>
+
+namespace cap4d {
+
+namespace base {
+extern const Kernels kKernels;
+}
+#ifdef CAP4D_HAS_X86_VARIANTS
+namespace v3 {
+extern const Kernels kKernels;
+}
+namespace v4 {
+extern const Kernels kKernels;
+}
+#endif
+
+namespace {
+
+const Kernels& choose() {
+#ifdef CAP4D_HAS_X86_VARIANTS
+  const char* wish = std::getenv("CAP4D_ISA");
+  const bool no_v4 = wish && std::strcmp(wish, "v4") != 0, no_v3 = no_v4 && std::strcmp(wish, "v3") != 0;
+  __builtin_cpu_init();
+  if (!no_v4 && __builtin_cpu_supports("x86-64-v4")) return v4::kKernels;
+  if (!no_v3 && __builtin_cpu_supports("x86-64-v3")) return v3::kKernels;
+#endif
+  return base::kKernels;
+}
+
+}  // namespace
+
+const Kernels& kernels() {
+  static const Kernels& chosen = choose();
+  return chosen;
+}
+
+}  // namespace cap4d

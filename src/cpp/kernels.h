@@ -1,0 +1,52 @@
+// The inner loops, compiled once per instruction set (see CMakeLists.txt) and chosen at run time.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "camera.h"
+#include "gaussians.h"
+
+namespace cap4d {
+
+struct Image {  // caller-owned, row major
+  float* rgb;    // [H, W, 3] composited on the background
+  float* alpha;  // [H, W]
+  float* depth;  // [H, W] expected depth m: sum of w_i z_i over alpha, 0 where alpha is 0
+};
+
+struct ImageGrad {
+  const float *rgb, *alpha, *depth;  // alpha and depth may be null: no gradient
+};
+
+// The tile's share of the work: which Gaussians, near to far, meet the pixels [x0, x0 + kTile) x [y0, y0 + kTile).
+struct TileJob {
+  const Splat* splats;
+  const std::uint32_t* isects;  // [count] indices into splats
+  std::size_t count;
+  int x0, y0;
+  const Camera* camera;
+  const float* background;  // [3]
+};
+
+// Where a Gaussian's per-tile gradients are: isect_grads[slots[k]] for k in [offsets[rank], offsets[rank + 1]).
+struct GradSlots {
+  const SplatGrad* isect_grads;
+  const std::uint32_t* slots;
+  const std::uint32_t* offsets;
+  const std::uint32_t* ranks;  // [N] place in depth order of each of the caller's Gaussians; read only where radii > 0
+};
+
+struct Kernels {
+  const char* isa;
+  // Fills splats and radii (3 standard deviations, px; 0 = not drawn) for Gaussians [begin, end); a splat only where drawn.
+  void (*project_fwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii);
+  void (*project_bwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, const std::int32_t* radii, const GradSlots&,
+                      const GaussianGrads&);
+  void (*rasterize_fwd)(const TileJob&, const Image&);
+  void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, SplatGrad* isect_grads);
+};
+
+// The widest variant this processor runs; CAP4D_ISA=base|v3|v4 in the environment asks for a narrower one.
+const Kernels& kernels();
+
+}  // namespace cap4d

@@ -1,0 +1,155 @@
+// As many floats as one register of the target holds, and the few operations on them. Arithmetic is the compiler's own
+// (GCC/Clang vector extensions). For sources that are compiled once per instruction set (CAP4D_ISA names the variant):
+// everything here lives in that variant's namespace, so that no wide code can leak into the baseline through the linker.
+// The scalar overloads let the maths be written once for float, double and FloatV.
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+#ifndef CAP4D_ISA
+#define CAP4D_ISA base
+#endif
+
+namespace cap4d::CAP4D_ISA {
+
+#define CAP4D_INLINE inline __attribute__((always_inline))
+
+#if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__) && defined(__AVX512BW__)
+#define CAP4D_AVX512 1
+inline constexpr int kLanes = 16;
+#elif defined(__AVX2__)
+inline constexpr int kLanes = 8;
+#else
+inline constexpr int kLanes = 4;
+#endif
+
+typedef float FloatV __attribute__((vector_size(4 * kLanes)));
+typedef std::int32_t IntV __attribute__((vector_size(4 * kLanes)));
+typedef float Float4 __attribute__((vector_size(16)));
+
+CAP4D_INLINE FloatV load(const float* p) {
+  FloatV v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+CAP4D_INLINE void store(float* p, FloatV v) { std::memcpy(p, &v, sizeof v); }
+CAP4D_INLINE Float4 load4(const float* p) {
+  Float4 v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+CAP4D_INLINE void store4(float* p, Float4 v) { std::memcpy(p, &v, sizeof v); }
+CAP4D_INLINE FloatV splat(float x) { return x - FloatV{}; }
+CAP4D_INLINE IntV as_int(FloatV v) { return reinterpret_cast<IntV>(v); }
+CAP4D_INLINE FloatV as_float(IntV v) { return reinterpret_cast<FloatV>(v); }
+
+#ifdef CAP4D_AVX512
+typedef __mmask16 MaskV;
+CAP4D_INLINE MaskV less(FloatV a, FloatV b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+CAP4D_INLINE MaskV less_equal(FloatV a, FloatV b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+CAP4D_INLINE FloatV select(MaskV m, FloatV yes, FloatV no) { return _mm512_mask_blend_ps(m, no, yes); }
+CAP4D_INLINE FloatV keep(MaskV m, FloatV v) { return _mm512_maskz_mov_ps(m, v); }
+CAP4D_INLINE std::uint32_t bits(MaskV m) { return m; }
+CAP4D_INLINE MaskV both(MaskV a, MaskV b) { return static_cast<MaskV>(a & b); }
+CAP4D_INLINE MaskV first_only(MaskV a, MaskV b) { return static_cast<MaskV>(a & ~b); }
+CAP4D_INLINE FloatV sqrt(FloatV v) { return _mm512_sqrt_ps(v); }
+CAP4D_INLINE FloatV min(FloatV a, FloatV b) { return _mm512_min_ps(a, b); }
+CAP4D_INLINE FloatV max(FloatV a, FloatV b) { return _mm512_max_ps(a, b); }
+#else
+typedef IntV MaskV;
+CAP4D_INLINE MaskV less(FloatV a, FloatV b) { return a < b; }
+CAP4D_INLINE MaskV less_equal(FloatV a, FloatV b) { return a <= b; }
+CAP4D_INLINE FloatV select(MaskV m, FloatV yes, FloatV no) { return m ? yes : no; }
+CAP4D_INLINE FloatV keep(MaskV m, FloatV v) { return as_float(m & as_int(v)); }
+CAP4D_INLINE MaskV both(MaskV a, MaskV b) { return a & b; }
+CAP4D_INLINE MaskV first_only(MaskV a, MaskV b) { return a & ~b; }
+#ifdef __AVX2__
+CAP4D_INLINE std::uint32_t bits(MaskV m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(as_float(m))); }
+CAP4D_INLINE FloatV sqrt(FloatV v) { return _mm256_sqrt_ps(v); }
+CAP4D_INLINE FloatV min(FloatV a, FloatV b) { return _mm256_min_ps(a, b); }
+CAP4D_INLINE FloatV max(FloatV a, FloatV b) { return _mm256_max_ps(a, b); }
+#else
+CAP4D_INLINE std::uint32_t bits(MaskV m) {
+  std::uint32_t r = 0;
+  for (int i = 0; i < kLanes; ++i) r |= (m[i] ? 1u : 0u) << i;
+  return r;
+}
+CAP4D_INLINE FloatV sqrt(FloatV v) {
+  for (int i = 0; i < kLanes; ++i) v[i] = std::sqrt(v[i]);
+  return v;
+}
+CAP4D_INLINE FloatV min(FloatV a, FloatV b) { return a < b ? a : b; }
+CAP4D_INLINE FloatV max(FloatV a, FloatV b) { return a > b ? a : b; }
+#endif
+#endif
+
+CAP4D_INLINE bool any(MaskV m) { return bits(m) != 0; }
+
+// 2^x for x <= 0, relative error below 3e-7: a degree 5 minimax polynomial on [-0.5, 0.5], the integer added to the exponent.
+CAP4D_INLINE FloatV exp2_nonpositive(FloatV x) {
+  x = max(x, splat(-125.0f));
+  const FloatV shifted = x + 12582912.0f;  // 1.5 * 2^23: the low mantissa bits now hold round(x)
+  const FloatV f = x - (shifted - 12582912.0f);
+  FloatV p = f * 1.327647154e-3f + 9.675541352e-3f;
+  p = p * f + 5.550713275e-2f;
+  p = p * f + 2.402211972e-1f;
+  p = p * f + 6.931469671e-1f;
+  p = p * f + 1.000000072f;
+  return as_float(as_int(p) + (as_int(shifted) << 23));
+}
+
+// log2(x) for normal x > 0, absolute error below 2e-7 near 1 (Cephes logf).
+CAP4D_INLINE FloatV log2_positive(FloatV x) {
+  const IntV raw = as_int(x) - 0x3f3504f3;  // sqrt(1/2)
+  const IntV exponent = raw >> 23;
+  const FloatV f = as_float((raw & 0x007fffff) + 0x3f3504f3) - 1.0f;
+  const FloatV z = f * f;
+  FloatV p = f * 7.0376836292e-2f - 1.1514610310e-1f;
+  p = p * f + 1.1676998740e-1f;
+  p = p * f - 1.2420140846e-1f;
+  p = p * f + 1.4249322787e-1f;
+  p = p * f - 1.6668057665e-1f;
+  p = p * f + 2.0000714765e-1f;
+  p = p * f - 2.4999993993e-1f;
+  p = p * f + 3.3333331174e-1f;
+  p = p * f * z - 0.5f * z;
+  return (f + p) * 1.44269504088896341f + __builtin_convertvector(exponent, FloatV);
+}
+
+// Sum of the lanes, in a fixed order.
+CAP4D_INLINE Float4 fold4(FloatV v) {
+#ifdef CAP4D_AVX512
+  const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps(v, 1));
+  return _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
+#elif defined(__AVX2__)
+  return _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+#else
+  return v;
+#endif
+}
+
+// Four sums at once: [sum a, sum b, sum c, sum d].
+CAP4D_INLINE Float4 sums4(Float4 a, Float4 b, Float4 c, Float4 d) {
+  typedef std::int32_t Int4 __attribute__((vector_size(16)));
+  const Float4 ab = __builtin_shuffle(a, b, Int4{0, 4, 1, 5}) + __builtin_shuffle(a, b, Int4{2, 6, 3, 7});
+  const Float4 cd = __builtin_shuffle(c, d, Int4{0, 4, 1, 5}) + __builtin_shuffle(c, d, Int4{2, 6, 3, 7});
+  return __builtin_shuffle(ab, cd, Int4{0, 1, 4, 5}) + __builtin_shuffle(ab, cd, Int4{2, 3, 6, 7});
+}
+
+// The same operations on one number.
+template <class T>
+concept Scalar = std::is_floating_point_v<T>;
+template <Scalar T> CAP4D_INLINE bool less(T a, T b) { return a < b; }
+template <Scalar T> CAP4D_INLINE T select(bool m, T yes, T no) { return m ? yes : no; }
+template <Scalar T> CAP4D_INLINE T keep(bool m, T v) { return m ? v : T(0); }
+template <Scalar T> CAP4D_INLINE T sqrt(T v) { return std::sqrt(v); }
+template <Scalar T> CAP4D_INLINE T min(T a, T b) { return a < b ? a : b; }
+template <Scalar T> CAP4D_INLINE T max(T a, T b) { return a > b ? a : b; }
+
+}  // namespace cap4d::CAP4D_ISA
