@@ -1,0 +1,182 @@
+"""Fitting an avatar to captures of a person: the loop around the trainer, and the files it leaves.
+
+Beside `me.cap4d` stand `me.fit.json` (numbers), `me.fit.png` (held-out frames: truth, ours, nearest training frame) and,
+while the fit runs, `me.fit.ckpt`.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cap4d.avatar.checkpoint import load_checkpoint, save_checkpoint
+from cap4d.avatar.corrections import Corrections
+from cap4d.avatar.model import create_avatar
+from cap4d.avatar.paint import paint
+from cap4d.avatar.presets import Preset, preset_named
+from cap4d.avatar.report import FitReport, compare, summarise, write_sheet
+from cap4d.avatar.trainer import Trainer
+from cap4d.avatar.views import FitView, Split, check_rig, load_views, split_views
+from cap4d.camera import opencv_from_rig
+from cap4d.capture.capture import Capture
+from cap4d.errors import ArgumentError
+from cap4d.rig.grid import build_grid
+from cap4d.rig.head import HeadRig
+
+log = logging.getLogger(__name__)
+
+ABLATIONS = (None, "unet")
+PAINT_VIEWS = 8
+REPORT_SECONDS = 10.0  # between progress lines
+
+
+def fit(
+    captures: Sequence[Path],
+    rig: HeadRig,
+    output: Path,
+    *,
+    preset: str | Preset = "low",
+    resume: bool = False,
+    ablate: str | None = None,
+    seed: int = 0,
+) -> FitReport:
+    """Fits an avatar and writes it, its report and its picture.
+
+    Args:
+        captures: Folders of one person; the first one gives the identity, the idle clip and the default camera.
+        rig: The head rig of the captures.
+        output: `.cap4d` file to write.
+        preset: Name of a preset, or one.
+        resume: Go on from the checkpoint of an interrupted fit, if there is one.
+        ablate: `unet` leaves the deformation network out.
+        seed: Same seed, same machine: same avatar.
+    Raises:
+        ArgumentError: An unknown preset or ablation, or no frame to train on.
+        DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
+    """
+    if ablate not in ABLATIONS:
+        raise ArgumentError(f"ablate: expected unet, got {ablate!r}")
+    settings = preset_named(preset) if isinstance(preset, str) else preset
+    started = time.monotonic()
+    loaded = [Capture.load(path) for path in captures]
+    for capture in loaded:
+        check_rig(capture, rig)
+    split = split_views(loaded, load_views(loaded, settings.image_size))
+    trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed)
+    checkpoint = output.with_suffix(".fit.ckpt")
+    kind = f"preset {settings.name}, rig {rig.name}, {len(split.train)} frames, ablate {ablate}, seed {seed}"
+    spent = 0.0
+    if resume and checkpoint.exists():
+        state = load_checkpoint(checkpoint, kind=kind)
+        trainer.restore(state["trainer"])
+        spent = state["seconds"]
+        log.info("%s: going on at step %d", checkpoint, trainer.step)
+
+    def save() -> None:
+        seconds = spent + time.monotonic() - started
+        save_checkpoint({"kind": kind, "trainer": trainer.state(), "seconds": seconds}, checkpoint)
+
+    log.info("fitting %d frames, %d held out; %s", len(split.train), len(split.held_out), settings.name)
+    run(trainer, save)
+    report = finish(
+        trainer, loaded, split, rig, output, ablate=ablate, seconds=lambda: spent + time.monotonic() - started
+    )
+    checkpoint.unlink(missing_ok=True)
+    return report
+
+
+def prepare(
+    captures: Sequence[Capture],
+    split: Split,
+    rig: HeadRig,
+    preset: Preset,
+    *,
+    ablate: str | None,
+    seed: int,
+) -> Trainer:
+    """A trainer at step 0."""
+    generator = torch.Generator().manual_seed(seed)
+    model = create_avatar(
+        rig,
+        captures[0].shape,
+        grid=build_grid(rig, preset.grid_size),
+        gaussians=preset.gaussians,
+        per_face=preset.per_face,
+        sh_degree=preset.sh_degree,
+        deformer_width=None if ablate == "unet" else preset.deformer_width,
+        generator=generator,
+    )
+    pivot = opencv_from_rig(model.subject.neutral.mean(0)).numpy()
+    corrections = [Corrections(c, _trained(i, c, split.train), pivot) for i, c in enumerate(captures)]
+    if preset.paint:
+        some = split.train[:: max(1, len(split.train) // PAINT_VIEWS)]
+        with torch.no_grad():
+            paint(model, some, [corrections[v.capture].at(v.frame).pose for v in some])
+    return Trainer(model, corrections, split.train, preset, seed=seed)
+
+
+def run(trainer: Trainer, save) -> None:
+    """Steps to the end, saying where it is every few seconds and saving now and then."""
+    preset = trainer.preset
+    begun, first = time.monotonic(), trainer.step
+    spoke, losses = begun, []
+    while trainer.step < preset.iterations:
+        losses.append(trainer.advance())
+        now = time.monotonic()
+        if now - spoke > REPORT_SECONDS or trainer.step == preset.iterations:
+            pace = (now - begun) / (trainer.step - first)
+            log.info(
+                "step %d/%d  loss %.4f  %d Gaussians  %.0f ms a step  %s left",
+                *(trainer.step, preset.iterations, float(np.mean(losses)), len(trainer.model), 1e3 * pace),
+                duration((preset.iterations - trainer.step) * pace),
+            )
+            spoke, losses = now, []
+        if trainer.step % preset.checkpoint_every == 0:
+            save()
+
+
+def finish(trainer, captures, split, rig, output: Path, *, ablate, seconds) -> FitReport:
+    """Compares with the held-out frames and writes avatar, numbers and picture."""
+    from cap4d.export.bundle import export_bundle
+
+    comparison = compare(trainer, split) if split.held_out else None
+    clip = trainer.corrections[0].corrected(captures[0].clip())
+    export_bundle(trainer.model, output, rig=rig, capture=captures[0], clip=clip)
+    if comparison is not None:
+        write_sheet(comparison, output.with_suffix(".fit.png"))
+    report = summarise(comparison, trainer, split, ablate=ablate, seconds=seconds())
+    report.write(output.with_suffix(".fit.json"))
+    _announce(report, output)
+    return report
+
+
+def _announce(report: FitReport, output: Path) -> None:
+    log.info(
+        "%s: %d Gaussians, %s, %.0f MB",
+        output,
+        report.gaussians,
+        duration(report.seconds),
+        report.peak_memory_mb,
+    )
+    if report.held_out_psnr is not None:
+        log.info(
+            "held-out PSNR %.2f dB (mean %.2f, SSIM %.3f); nearest training frame %.2f dB (mean %.2f)",
+            *(report.held_out_psnr, report.held_out_psnr_mean, report.held_out_ssim),
+            *(report.nearest_frame_psnr, report.nearest_frame_psnr_mean),
+        )
+
+
+def _trained(index: int, capture: Capture, train: Sequence[FitView]) -> np.ndarray:
+    marks = np.zeros(len(capture), bool)
+    marks[[v.frame for v in train if v.capture == index]] = True
+    return marks
+
+
+def duration(seconds: float) -> str:
+    """`75` -> `1:15`."""
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

@@ -1,0 +1,178 @@
+"""What a fit is worth: its pictures of held-out frames against the truth, beside the nearest training frames."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cap4d.atomic import replacing
+from cap4d.avatar.trainer import Trainer
+from cap4d.avatar.views import FitView, Split
+from cap4d.capture.image import write_image
+from cap4d.evaluate.image import mse, pooled_psnr, psnr_of_mse, ssim
+
+SHEET_ROWS = 6
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """The numbers of a fit, as they are written to `.fit.json`. PSNRs in dB; None where no frame is held out.
+
+    Args:
+        held_out_psnr: Of the squared error pooled over all pixels of all held-out frames.
+        nearest_frame_psnr: The same for the baseline: for every held-out frame the training frame of the same size and
+            camera that resembles it most (least squared error, so it is the best that replaying could do).
+        nearest_in_time_psnr: The same for the training frame nearest in time.
+        held_out_psnr_mean, nearest_frame_psnr_mean: Means of the frames' own PSNRs.
+        held_out_ssim: Mean SSIM.
+        between, tail: The same numbers for held-out frames with training frames on both sides in time, and for those
+            after the last training frame.
+        train_psnr: Pooled over some training frames.
+        seconds: Wall time of the fit.
+        peak_memory_mb: Greatest resident memory of the process.
+    """
+
+    preset: str
+    ablate: str | None
+    iterations: int
+    gaussians: int
+    train_frames: int
+    held_out_frames: int
+    held_out_psnr: float | None
+    nearest_frame_psnr: float | None
+    nearest_in_time_psnr: float | None
+    held_out_psnr_mean: float | None
+    nearest_frame_psnr_mean: float | None
+    held_out_ssim: float | None
+    between: dict[str, float]
+    tail: dict[str, float]
+    train_psnr: float
+    seconds: float
+    peak_memory_mb: float
+
+    def write(self, path: Path) -> None:
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(asdict(self), indent=1, allow_nan=False) + "\n")
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Held-out frames beside our pictures and the baselines.
+
+    Args:
+        truth, ours, nearest: float32[H, W, 3] per frame.
+        errors: {"ours", "nearest", "time"} -> float64[K] mean squared errors.
+        ssim: float64[K] of ours.
+        tail: bool[K] frames after the last training frame.
+    """
+
+    truth: list[np.ndarray]
+    ours: list[np.ndarray]
+    nearest: list[np.ndarray]
+    errors: dict[str, np.ndarray]
+    ssim: np.ndarray
+    tail: np.ndarray
+
+    def summary(self, mask: np.ndarray) -> dict[str, float]:
+        """The numbers of a subset of the frames; empty for none."""
+        if not mask.any():
+            return {}
+        e = {name: values[mask] for name, values in self.errors.items()}
+        return {
+            "frames": int(mask.sum()),
+            "held_out_psnr": pooled_psnr(e["ours"]),
+            "nearest_frame_psnr": pooled_psnr(e["nearest"]),
+            "nearest_in_time_psnr": pooled_psnr(e["time"]),
+            "held_out_psnr_mean": _mean_psnr(e["ours"]),
+            "nearest_frame_psnr_mean": _mean_psnr(e["nearest"]),
+            "held_out_ssim": float(self.ssim[mask].mean()),
+        }
+
+
+def render_views(trainer: Trainer, views: Sequence[FitView]) -> list[np.ndarray]:
+    """float32[H, W, 3] in [0, 1] of each view, with its frame's corrections."""
+    with torch.no_grad():
+        return [trainer.render(view)[1].rgb.clamp(0, 1).numpy() for view in views]
+
+
+def compare(trainer: Trainer, split: Split) -> Comparison:
+    """Renders every held-out frame and finds its baselines among the training frames."""
+    ours = render_views(trainer, split.held_out)
+    truth = [view.target.numpy() for view in split.held_out]
+    by_pixels, by_time = zip(*(_baselines(view, split.train) for view in split.held_out), strict=True)
+    errors = {
+        name: np.array([mse(a, b) for a, b in zip(images, truth, strict=True)])
+        for name, images in (("ours", ours), ("nearest", by_pixels), ("time", by_time))
+    }
+    similar = np.array([ssim(a, b) for a, b in zip(ours, truth, strict=True)])
+    return Comparison(truth, ours, list(by_pixels), errors, similar, split.tail)
+
+
+def _baselines(view: FitView, train: Sequence[FitView]) -> tuple[np.ndarray, np.ndarray]:
+    """The training image most like `view`'s, and the one nearest in time (the more alike of two as near)."""
+    target = view.target
+    like = [t for t in train if t.pixels.shape == view.pixels.shape]
+    if not like:
+        white = np.ones(target.shape, np.float32)
+        return white, white
+    errors = [float((t.target - target).square().mean()) for t in like]
+    best = min(range(len(like)), key=errors.__getitem__)
+    apart = [(t.capture != view.capture, abs(t.frame - view.frame)) for t in like]
+    soonest = min(range(len(like)), key=lambda i: (*apart[i], errors[i]))
+    return like[best].target.numpy(), like[soonest].target.numpy()
+
+
+def summarise(
+    comparison: Comparison | None, trainer: Trainer, split: Split, *, ablate: str | None, seconds: float
+) -> FitReport:
+    """Puts the report together; `comparison` is None where nothing is held out."""
+    everything = between = tail = {}
+    if comparison is not None:
+        everything = comparison.summary(np.ones_like(comparison.tail))
+        between, tail = comparison.summary(~comparison.tail), comparison.summary(comparison.tail)
+    some = split.train[:: max(1, len(split.train) // 16)]
+    pictures = render_views(trainer, some)
+    train_errors = np.array([mse(a, v.target.numpy()) for a, v in zip(pictures, some, strict=True)])
+    names = ("held_out_psnr", "nearest_frame_psnr", "nearest_in_time_psnr", "held_out_psnr_mean")
+    names += ("nearest_frame_psnr_mean", "held_out_ssim")
+    return FitReport(
+        preset=trainer.preset.name,
+        ablate=ablate,
+        iterations=trainer.step,
+        gaussians=len(trainer.model),
+        train_frames=len(split.train),
+        held_out_frames=len(split.held_out),
+        **{name: everything.get(name) for name in names},
+        between=between,
+        tail=tail,
+        train_psnr=pooled_psnr(train_errors),
+        seconds=round(seconds, 1),
+        peak_memory_mb=round(peak_memory_mb(), 1),
+    )
+
+
+def write_sheet(comparison: Comparison, path: Path) -> None:
+    """A picture for the eye: rows of held-out frames; truth, ours, nearest training frame."""
+    chosen = np.unique(np.linspace(0, len(comparison.truth) - 1, SHEET_ROWS).round().astype(int))
+    sources = (comparison.truth, comparison.ours, comparison.nearest)
+    height = min(comparison.truth[i].shape[0] for i in chosen)
+    width = min(comparison.truth[i].shape[1] for i in chosen)
+    rows = [np.concatenate([images[i][:height, :width] for images in sources], 1) for i in chosen]
+    write_image(path, np.concatenate(rows))
+
+
+def peak_memory_mb() -> float:
+    """Greatest resident size of this process so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+def _mean_psnr(errors: np.ndarray) -> float:
+    return float(np.mean([psnr_of_mse(e) for e in errors]))

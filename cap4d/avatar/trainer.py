@@ -1,0 +1,195 @@
+"""One optimisation step at a time: render a view, compare, step Adam, and now and then densify.
+
+All randomness is a function of the seed and the step, so a resumed fit repeats an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from cap4d.avatar.corrections import Corrections
+from cap4d.avatar.densify import Evidence, Rows, densify, reset_opacity
+from cap4d.avatar.losses import (
+    laplacian_loss,
+    photometric,
+    position_loss,
+    relative_deformation_loss,
+    relative_rotation_loss,
+    scale_loss,
+)
+from cap4d.avatar.model import AvatarModel, Posed
+from cap4d.avatar.presets import Preset
+from cap4d.avatar.views import FitView
+from cap4d.bind import triangle_frames
+from cap4d.camera import opencv_from_rig
+from cap4d.raster import Rasterized, rasterize
+
+WHITE = (1.0, 1.0, 1.0)
+ADAM_EPS = 1e-15  # fact 36; gradients of a mean over pixels are tiny
+
+
+class Trainer:
+    """An avatar, the corrections of its captures, and the optimiser of both.
+
+    Args:
+        model: What is fitted.
+        corrections: One per capture.
+        views: Training views.
+        preset: Schedule, rates and weights.
+        seed: Of the order of views and of densification.
+    """
+
+    def __init__(
+        self,
+        model: AvatarModel,
+        corrections: Sequence[Corrections],
+        views: Sequence[FitView],
+        preset: Preset,
+        *,
+        seed: int,
+    ) -> None:
+        self.model, self.preset, self.views, self.seed = model, preset, views, seed
+        self.corrections = nn.ModuleList(corrections)
+        self.step = 0
+        self.evidence = Evidence(len(model))
+        self.optimizer = _optimizer(model, self.corrections, preset)
+        self.rows = Rows(model, self.optimizer)
+        neutral = opencv_from_rig(model.subject.neutral)
+        self.face_sizes = triangle_frames(neutral, model.faces)[2]
+
+    def advance(self) -> float:
+        """Takes one step and returns its loss."""
+        self._set_rates()
+        view = self.views[self._view_index()]
+        posed, rendered = self.render(view)
+        loss = self._loss(view, posed, rendered)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.evidence.add(rendered.means2d.grad, rendered.radii)
+        self.optimizer.step()
+        self.step += 1
+        self._refine()
+        return loss.item()
+
+    def render(self, view: FitView) -> tuple[Posed, Rasterized]:
+        """The avatar as it should look in a view, with the corrections of its frame."""
+        corrected = self.corrections[view.capture].at(view.frame)
+        posed = self.model.pose(corrected.pose, rigid=corrected.rigid)
+        rendered = rasterize(
+            posed.means,
+            posed.quats,
+            posed.scales,
+            posed.opacities,
+            posed.sh,
+            camera=view.camera,
+            background=WHITE,
+            sh_degree=self.sh_degree,
+        )
+        return posed, rendered
+
+    @property
+    def sh_degree(self) -> int:
+        """Harmonics come in one degree at a time (fact 37)."""
+        return min(self.preset.sh_degree, self.step // self.preset.sh_every)
+
+    def _loss(self, view: FitView, posed: Posed, rendered: Rasterized) -> torch.Tensor:
+        w, local = self.preset.weights, self.model.gaussians
+        visible = rendered.radii > 0
+        loss = photometric(rendered.rgb, view.target, w)
+        if view.coverage is not None and w.matte > 0:
+            loss = loss + w.matte * (rendered.alpha - view.coverage.float()).abs().mean()
+        loss = loss + w.position * position_loss(local["means"], visible, w.position_limit)
+        loss = loss + w.scale * scale_loss(local["log_scales"], visible, w.scale_limit)
+        loss = loss + w.pose * self.corrections[view.capture].penalty()
+        d = posed.deformation
+        if d is None:
+            return loss
+        loss = loss + w.laplacian * laplacian_loss(d.maps)
+        loss = loss + w.deformation * relative_deformation_loss(d.moved, d.neutral)
+        return loss + w.rotation * relative_rotation_loss(posed.rotmats, posed.neutral_rotmats)
+
+    def _refine(self) -> None:
+        d = self.preset.densify
+        if d.start <= self.step <= d.stop and self.step % d.every == 0:
+            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
+            densify(
+                self.rows,
+                self.evidence,
+                d,
+                face_sizes=self.face_sizes,
+                step=self.step,
+                per_face=self.preset.per_face,
+                generator=generator,
+            )
+            self.evidence = Evidence(len(self.model))
+        if d.reset_every and self.step % d.reset_every == 0 and self.step <= d.stop:
+            reset_opacity(self.rows)
+
+    def _view_index(self) -> int:
+        """Every view once per epoch, in an order that depends on nothing but seed and epoch."""
+        epoch, position = divmod(self.step, len(self.views))
+        return int(np.random.default_rng([self.seed, epoch]).permutation(len(self.views))[position])
+
+    def _set_rates(self) -> None:
+        t = self.step / max(1, self.preset.iterations)
+        for group in self.optimizer.param_groups:
+            first, last = group["ends"]
+            group["lr"] = math.exp((1 - t) * math.log(first) + t * math.log(last))
+
+    # checkpoint ----------------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything a resumed fit needs: tensors, and plain numbers and lists."""
+        return {
+            "step": self.step,
+            "seed": self.seed,
+            "gaussians": {name: value.detach() for name, value in self.model.gaussians.items()},
+            "binding": self.model.binding,
+            "deformer": {} if self.model.deformer is None else self.model.deformer.state_dict(),
+            "corrections": self.corrections.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "evidence": [self.evidence.gradient, self.evidence.seen, self.evidence.radius],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Takes up a `state`. Its sizes must be those of this trainer but for the number of Gaussians."""
+        self.step = state["step"]
+        for name, value in state["gaussians"].items():
+            self.model.gaussians[name] = nn.Parameter(value)
+        self.model.binding = state["binding"]
+        if self.model.deformer is not None:
+            self.model.deformer.load_state_dict(state["deformer"])
+        self.corrections.load_state_dict(state["corrections"])
+        self.optimizer = _optimizer(self.model, self.corrections, self.preset)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.rows = Rows(self.model, self.optimizer)
+        self.evidence = Evidence(len(self.model))
+        self.evidence.gradient, self.evidence.seen, self.evidence.radius = state["evidence"]
+
+
+def _optimizer(model: AvatarModel, corrections: nn.ModuleList, preset: Preset) -> torch.optim.Adam:
+    r = preset.rates
+    ends = {
+        "means": r.means,
+        "sh_dc": r.sh_dc,
+        "sh_rest": r.sh_rest,
+        "opacity_logits": r.opacity,
+        "log_scales": r.scale,
+        "quats": r.rotation,
+    }
+    groups: list[dict[str, Any]] = [
+        {"params": [model.gaussians[n]], "ends": e} for n, e in ends.items() if model.gaussians[n].numel()
+    ]
+    groups.append({"params": list(corrections.parameters()), "ends": r.correction})
+    if model.deformer is not None:
+        decay = r.deformer_decay
+        groups.append(
+            {"params": list(model.deformer.parameters()), "ends": r.deformer, "weight_decay": decay}
+        )
+    return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPS, fused=True)

@@ -1,0 +1,112 @@
+"""A fitted avatar as the file a player opens: its network as ONNX, its Gaussians raw, an idle clip, a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cap4d.avatar.model import AvatarModel, Pose
+from cap4d.bundle.bundle import Bundle
+from cap4d.bundle.writer import write_bundle
+from cap4d.camera import Camera, head_fixed
+from cap4d.capture.capture import Capture
+from cap4d.drive.clip import Clip
+from cap4d.errors import Cap4dError
+from cap4d.export.deformer import export_deformer, worst_difference
+from cap4d.export.idle import idle_clip
+from cap4d.gaussians import Gaussians
+from cap4d.player.png import encode_png
+from cap4d.render import render
+from cap4d.rig.grid import remesh
+from cap4d.rig.head import HeadRig
+
+WORST_ONNX_DIFFERENCE = 1e-5  # of the range of the map
+COMPARED_FRAMES = 4
+PREVIEW_SIZE = 512
+
+
+def export_bundle(
+    model: AvatarModel,
+    path: Path,
+    *,
+    rig: HeadRig,
+    capture: Capture,
+    clip: Clip | None = None,
+) -> None:
+    """Writes `path`, a `.cap4d` file.
+
+    Args:
+        model: The avatar.
+        rig: The rig it stands on.
+        capture: Its identity is the avatar's, its first camera the default one.
+        clip: The capture's parameters as the fit corrected them, for the idle clip; None: as they were tracked.
+    Raises:
+        Cap4dError: The exported network does not answer as the fitted one does.
+    """
+    clip = capture.clip() if clip is None else clip
+    write_bundle(make_bundle(model, rig=rig, capture=capture, clip=clip), path)
+
+
+def make_bundle(model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Clip) -> Bundle:
+    """The avatar as a player needs it. `clip` is the capture's, corrected or not."""
+    mesh_subject = rig.subject(capture.shape)
+    camera = default_camera(capture, clip)
+    local = {name: value.detach().numpy() for name, value in model.gaussians.items()}
+    return Bundle(
+        rig_licence=rig.licence,
+        expression_range=np.asarray(rig.expression_range, np.float32),
+        grid=model.grid,
+        subject=remesh(mesh_subject, model.grid),
+        deform_neutral=model.neutral_deformation().numpy(),
+        deform_onnx=None if model.deformer is None else checked_onnx(model, clip),
+        means=local["means"],
+        quats=local["quats"],
+        log_scales=local["log_scales"],
+        opacity_logits=local["opacity_logits"],
+        sh=np.concatenate([local["sh_dc"], local["sh_rest"]], 1),
+        binding=model.binding.numpy().astype(np.int32),
+        camera=camera,
+        idle=idle_clip(clip, rig.expression_names),
+        preview=preview(model, clip, camera),
+        mesh_subject=mesh_subject,
+    )
+
+
+def checked_onnx(model: AvatarModel, clip: Clip) -> bytes:
+    """The network as ONNX, compared with torch on offsets of the clip.
+
+    Raises:
+        Cap4dError: They differ by more than 1e-5 of the answers' range.
+    """
+    data = export_deformer(model.deformer)
+    frames = np.linspace(0, len(clip) - 1, min(COMPARED_FRAMES, len(clip))).round().astype(int)
+    with torch.no_grad():
+        offsets = torch.stack([model.offsets(Pose.of(clip.frame(t))) for t in frames])
+    difference = worst_difference(data, model.deformer, offsets)
+    if difference > WORST_ONNX_DIFFERENCE:
+        raise Cap4dError(
+            f"deform.onnx: expected within {WORST_ONNX_DIFFERENCE:g} of torch, found {difference:.2g}"
+        )
+    return data
+
+
+def default_camera(capture: Capture, clip: Clip) -> Camera:
+    """The capture's first camera as it stands to the head on average, in the head-fixed world."""
+    camera = next(iter(capture.cameras.values()))
+    rot, tra = np.median(clip.rot, 0), np.median(clip.tra, 0)
+    return Camera(camera.K, head_fixed(camera.viewmat, rot, tra), camera.width, camera.height)
+
+
+def preview(model: AvatarModel, clip: Clip, camera: Camera) -> bytes:
+    """PNG of the avatar at the clip's calmest frame, on white."""
+    calm = int(np.abs(clip.expr).sum(1).argmin())
+    with torch.no_grad():
+        posed = model.pose(Pose.of(clip.frame(calm)))
+    scale = PREVIEW_SIZE / max(camera.width, camera.height)
+    view = camera.resized(round(camera.width * scale), round(camera.height * scale))
+    fields = (posed.means, posed.quats, posed.scales, posed.opacities, posed.sh)
+    gaussians = Gaussians(*(np.ascontiguousarray(f.numpy()) for f in fields))
+    rgb = render(gaussians, view).rgb
+    return encode_png((np.clip(rgb, 0, 1) * 255).round().astype(np.uint8))
