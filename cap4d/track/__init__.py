@@ -1,1 +1,5 @@
-"""Photos and video in, a capture out."""
+"""Photos and video to captures."""
+
+from cap4d.track.tracker import TrackReport, track
+
+__all__ = ["TrackReport", "track"]
