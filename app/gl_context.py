@@ -48,5 +48,5 @@ def _context(**settings: object) -> moderngl.Context:
         ctx = moderngl.create_context(require=REQUIRED, **settings)
     except Exception as error:  # glcontext raises plain Exception
         raise GlUnavailableError(f"OpenGL: expected a driver for 4.1 core, found none ({error})") from error
-    ctx.gc_mode = "auto"
+    ctx.gc_mode = "context_gc"  # dropped objects wait for `ctx.gc()`; none is deleted after its context
     return ctx

@@ -122,6 +122,8 @@ class SplatPass:
     def _resize(self, width: int, height: int) -> None:
         if self.picture is not None and self.picture.size == (width, height):
             return
+        self.picture = self.target = None
+        self.ctx.gc()
         self.picture = self.ctx.texture((width, height), 4, dtype=self.texture_type)
         self.picture.repeat_x = self.picture.repeat_y = False
         self.target = self.ctx.framebuffer(self.picture)

@@ -1,0 +1,64 @@
+"""Playing without a window: every frame of the clip, into a file."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
+from cap4d.app.options import Options
+from cap4d.camera import Camera
+from cap4d.drive.clip import Frame
+from cap4d.drive.source import open_source
+from cap4d.player.avatar import Avatar
+from cap4d.player.offline import Draw, Output, draw_on_cpu, render_to
+
+log = logging.getLogger(__name__)
+
+
+def play_headless(path: Path, options: Options) -> None:
+    """Renders the avatar at `path` to `options.out`, or to a video of its name in the current folder.
+
+    Raises:
+        ArgumentError, DataError: See `cap4d.player.offline.render_to`.
+        GlUnavailableError: `--backend gl` without OpenGL 4.1.
+    """
+    avatar = Avatar.load(path, deformer=options.deformer)
+    clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
+    backend, draw = choose_backend(options.backend, avatar)
+    out = options.out or f"{path.stem}.mp4"
+    output = Output(out, frames=options.frames, size=options.size, stats=options.stats)
+    stats = render_to(avatar, clip, options.camera, output, draw=draw, backend=backend)
+    log.info("%s: %d frames, %.1f fps (%s)", out, stats["frames"], stats["fps"], backend)
+
+
+def choose_backend(wanted: str, avatar: Avatar) -> tuple[str, Draw]:
+    """The backend's name and its call.
+
+    Args:
+        wanted: `cpu`, `gl`, or `auto`: OpenGL where a GPU is behind it, since a software driver takes several
+            times as long as the CPU renderer.
+    Raises:
+        GlUnavailableError: `gl` is wanted and not there.
+    """
+    if wanted == "cpu":
+        return "cpu", draw_on_cpu
+    try:
+        ctx = headless_context()
+    except GlUnavailableError:
+        if wanted == "gl":
+            raise
+        return "cpu", draw_on_cpu
+    if wanted == "auto" and is_software(ctx):
+        ctx.release()
+        return "cpu", draw_on_cpu
+    from cap4d.app.renderers import GlRenderer
+
+    renderer = GlRenderer(ctx, avatar)
+
+    def draw_on_gpu(_: Avatar, frame: Frame, camera: Camera) -> np.ndarray:
+        return renderer.draw(frame, camera)
+
+    return "gl", draw_on_gpu

@@ -1,0 +1,68 @@
+"""`cap4d-view`: plays an avatar in a window, or without a display into a file."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cap4d.app.options import Options, parse_options
+from cap4d.errors import ArgumentError, Cap4dError
+
+log = logging.getLogger(__name__)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Returns the exit code: 0 success, 1 bad data or no OpenGL, 2 a bad argument, 130 interrupted."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    options = parse_options(argv)
+    try:
+        play(options)
+    except ArgumentError as error:
+        print(f"cap4d-view: {error}", file=sys.stderr)
+        return 2
+    except Cap4dError as error:
+        print(f"cap4d-view: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("cap4d-view: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def play(options: Options) -> None:
+    """Opens the window, or renders offline when there is to be none or can be none."""
+    avatar = options.avatar if options.avatar is not None else demo_avatar()
+    if not avatar.is_file():
+        raise ArgumentError(f"avatar: expected a .cap4d file, found none at {avatar}")
+    if options.headless or options.out is not None or not play_in_window(avatar, options):
+        from cap4d.app.headless import play_headless
+
+        play_headless(avatar, options)
+
+
+def play_in_window(avatar: Path, options: Options) -> bool:
+    """False, and one line that says so, where there is no display."""
+    from cap4d.app.live import play_live
+    from cap4d.app.window import DisplayUnavailableError, Window
+
+    try:
+        window = Window(f"{avatar.name} - cap4d-view", *options.size)
+    except DisplayUnavailableError as error:
+        log.info("%s; rendering offline instead", error)
+        return False
+    with window:
+        play_live(avatar, options, window)
+    return True
+
+
+def demo_avatar() -> Path:
+    """The built-in demo avatar, made the first time it is asked for."""
+    from cap4d.demo import demo_avatar_path
+
+    return demo_avatar_path()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,93 @@
+"""The command line of `cap4d-view`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+MAX_SIDE = 8192  # px
+EXAMPLES = """examples:
+  cap4d-view                                   the built-in demo avatar, in a window
+  cap4d-view me.cap4d                          drag turns, right drag (or shift) pans, the wheel zooms
+  cap4d-view me.cap4d --drive fit.npz          driven by a FlowFace sequence
+  cap4d-view me.cap4d --drive speech.npy --template neutral.npy --fps 30
+  cap4d-view me.cap4d --headless --frames 120 --out out.mp4 --stats stats.json
+  cap4d-view me.cap4d --headless --camera orbit --out frame_%04d.png
+
+keys: space pause, left/right step a frame, r reset, h read-out, q or escape quit
+"""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What was asked for. `None` leaves the choice to the program; see `build_parser` for each."""
+
+    avatar: Path | None
+    drive: str | None
+    template: Path | None
+    fps: float | None
+    backend: str
+    deformer: str
+    size: tuple[int, int]
+    headless: bool
+    frames: int | None
+    out: str | None
+    camera: str
+    stats: Path | None
+
+
+def parse_options(argv: Sequence[str] | None = None) -> Options:
+    """Exits with code 2 and one line on a bad argument, with 0 after `--help`."""
+    return Options(**vars(build_parser().parse_args(argv)))
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="cap4d-view",
+        description="Plays a 4D avatar live in a window, or renders it to a file.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("avatar", nargs="?", type=Path, metavar="AVATAR.cap4d", help="default: the built-in demo avatar")
+    add("--drive", metavar="SRC", help="fit.npz or vertices .npy (default: the avatar's idle clip)")
+    add("--template", type=Path, metavar="FILE", help="neutral vertices of a .npy stream")
+    add("--fps", type=_rate, help="frames per second of the source, whatever it says itself")
+    add("--backend", choices=("auto", "gl", "cpu"), default="auto", help="auto: gl where there is a GPU")
+    add("--deformer", choices=("auto", "full", "off"), default="auto", help="the deformation network")
+    add("--size", type=_size, default=(512, 512), metavar="WxH", help="of window or picture (512x512)")
+    add("--headless", action="store_true", help="no window: render to --out")
+    add(
+        "--frames", type=_count, metavar="N", help="stop after N frames (headless: default is the clip, once)"
+    )
+    add("--out", metavar="FILE", help="out.mp4, frame_%%04d.png or one.png (headless: default <avatar>.mp4)")
+    add("--camera", default="static", metavar="static|orbit|FILE", help="camera path (static)")
+    add("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
+    return parser
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(1 <= side <= MAX_SIDE for side in size):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT, 1 to {MAX_SIDE} px each, got {text}")
+    return size
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number, 1 or more, got {text}")
+    return int(text)
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value <= 1000:
+        raise argparse.ArgumentTypeError(f"expected frames per second, above 0 and up to 1000, got {text}")
+    return value

@@ -1,0 +1,52 @@
+"""Which frame of a clip is due now. Pure: callers pass the time, so that it can be tested without waiting."""
+
+from __future__ import annotations
+
+
+class PlayClock:
+    """Plays frame after frame at `fps` on the wall clock. Too slow a player skips frames; it never slows down.
+
+    Indices grow without end; a clip repeats by taking them modulo its length (`Clip.frame`).
+
+    Args:
+        fps: Frames per second.
+        now: The current time, s, on any clock that only goes forward.
+    """
+
+    def __init__(self, fps: float, now: float) -> None:
+        self.fps = fps
+        self.paused = False
+        self.dropped = 0  # frames that were due and never shown
+        self._start = now
+        self._shown = -1
+
+    def index(self, now: float) -> int:
+        """The frame due at `now`; frames passed over since the last call count as dropped."""
+        if self.paused:
+            return max(self._shown, 0)
+        due = max(int((now - self._start) * self.fps + 1e-6), self._shown, 0)
+        self.dropped += max(due - self._shown - 1, 0)
+        self._shown = due
+        return due
+
+    def due(self) -> float:
+        """When the next frame is due."""
+        return float("inf") if self.paused else self._start + (self._shown + 1) / self.fps
+
+    def toggle(self, now: float) -> None:
+        """Pauses, or goes on from the frame shown."""
+        self.paused = not self.paused
+        self._start_at(max(self._shown, 0), now)
+
+    def step(self, frames: int) -> None:
+        """Pauses and moves by `frames`, not before the first."""
+        self.paused = True
+        self._shown = max(self._shown + frames, 0)
+
+    def rewind(self, now: float) -> None:
+        """Back to the first frame."""
+        self._shown = 0
+        self._start_at(0, now)
+
+    def _start_at(self, index: int, now: float) -> None:
+        self._start = now - index / self.fps
