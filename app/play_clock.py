@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class PlayClock:
-    """Plays frame after frame at `fps` on the wall clock. Too slow a player skips frames; it never slows down.
+    """Plays frame after frame at `fps` on the wall clock. A slow player skips frames; it never slows down.
 
     Indices grow without end; a clip repeats by taking them modulo its length (`Clip.frame`).
 

@@ -5,6 +5,10 @@
 #include "lib/projection.glsl"
 #include "lib/spherical_harmonics.glsl"
 
+const float ROUNDING = 0.01;   // px
+const float QUAT_NORM_MIN = 1e-10;
+const float INFINITE = 1e30;   // a determinant that is no number is not smaller
+
 uniform sampler2D grid_vertices;  // vertex i at texel (i % width, i / width), m
 uniform mat4 viewmat;             // view from world
 uniform vec3 eye;                 // the optical centre in the world, m
@@ -28,9 +32,8 @@ vec3 grid_vertex(uint index) {
 }
 
 // The half axes of the ellipse in which opacity * exp(-d'Sd/2) reaches ALPHA_MIN: eigenvectors of the covariance.
-vec4 cutoff_axes(vec3 covariance, float opacity) {
+vec4 cutoff_axes(vec3 covariance, float determinant, float opacity) {
     float reach = 2.0 * log(opacity / ALPHA_MIN);  // squared, in standard deviations
-    if (!(reach > 0.0)) return vec4(0.0);
     float half_sum = 0.5 * (covariance.x + covariance.z);
     float half_difference = 0.5 * (covariance.x - covariance.z);
     float spread = length(vec2(half_difference, covariance.y));
@@ -38,23 +41,26 @@ vec4 cutoff_axes(vec3 covariance, float opacity) {
     vec2 major = half_difference >= 0.0 ? vec2(half_difference + spread, covariance.y)
                                         : vec2(covariance.y, spread - half_difference);
     major = spread > 0.0 ? normalize(major) : vec2(1.0, 0.0);
-    float major_length = sqrt(reach * (half_sum + spread)) + 0.01;
-    float minor_length = sqrt(reach * max(half_sum - spread, LOW_PASS)) + 0.01;
-    return vec4(major * major_length, vec2(-major.y, major.x) * minor_length);
+    float variance = half_sum + spread;
+    vec2 half_axes = sqrt(reach * vec2(variance, determinant / variance)) + ROUNDING;
+    return vec4(major * half_axes.x, vec2(-major.y, major.x) * half_axes.y);
 }
 
 void main() {
     TriangleFrame frame = triangle_frame(grid_vertex(triangle.x), grid_vertex(triangle.y), grid_vertex(triangle.z));
     vec3 mean = frame.rotation * mean_opacity.xyz * frame.size + frame.centre;
     vec3 view = (viewmat * vec4(mean, 1.0)).xyz;
-    mat3 view_rotation = mat3(viewmat) * frame.rotation * quat_to_rotmat(quat);
-    mat3 covariance = covariance_3d(view_rotation, exp(log_scale) * frame.size);
-    vec3 cov2d = covariance_2d(covariance, view, Pinhole(intrinsics.xy, intrinsics.zw, image_size));
-    float determinant = cov2d.x * cov2d.z - cov2d.y * cov2d.y;
+    vec4 local = quat / max(length(quat), QUAT_NORM_MIN);
+    mat3 rotation = mat3(viewmat) * quat_to_rotmat(quat_product(normalize(rotmat_to_quat(frame.rotation)), local));
+    vec3 scale = exp(log_scale) * frame.size;
+    mat3 principal = mat3(rotation[0] * scale.x, rotation[1] * scale.y, rotation[2] * scale.z);
+    Footprint footprint = project(view, principal, Pinhole(intrinsics.xy, intrinsics.zw, image_size));
 
+    vec3 covariance = footprint.covariance;
     float opacity = mean_opacity.w;
-    mean2d = view.xy / view.z * intrinsics.xy + intrinsics.zw;
-    conic = vec3(cov2d.z, -cov2d.y, cov2d.x) / determinant;
+    bool visible = view.z >= NEAR && opacity > ALPHA_MIN && footprint.determinant < INFINITE;
+    mean2d = footprint.mean2d;
+    conic = vec3(covariance.z, -covariance.y, covariance.x) / footprint.determinant;
     color_opacity = vec4(eval_sh(sh, normalize(mean - eye)), opacity);
-    axes = view.z >= NEAR && determinant > 0.0 ? cutoff_axes(cov2d, opacity) : vec4(0.0);
+    axes = visible ? cutoff_axes(covariance, footprint.determinant, opacity) : vec4(0.0);
 }

@@ -1,8 +1,8 @@
 // Reads:   SAFE_NORM2.
 // Defines: TriangleFrame, triangle_frame.
-// Maths:   GaussianAvatars (Qian et al. 2024, sec. 3.2) with CAP4D's face scale (fact 27): a0 along the first edge, a1 the
-//          normal, a2 = -(a1 x a0); the scale is the mean of the first edge's length and the height above it. A zero
-//          vector stays zero when normalised, so the Gaussians of a collapsed triangle shrink to a point.
+// Maths:   GaussianAvatars (Qian et al. 2024, sec. 3.2) with CAP4D's face scale (fact 27), as in bind.cpp: a0 along the
+//          first edge, a1 the normal, a2 = -(a1 x a0); the size is the mean of the first edge's length and the height
+//          above it. A triangle without area gets some rotation and its own, possibly zero, size.
 
 struct TriangleFrame {
     vec3 centre;
@@ -15,10 +15,10 @@ vec3 safe_normalize(vec3 v) {
 }
 
 TriangleFrame triangle_frame(vec3 v0, vec3 v1, vec3 v2) {
-    vec3 edge = v1 - v0;
+    vec3 edge = v1 - v0, side = v2 - v0;
     vec3 a0 = safe_normalize(edge);
-    vec3 a1 = safe_normalize(cross(a0, v2 - v0));
-    vec3 a2 = -safe_normalize(cross(a1, a0));
-    float size = 0.5 * (length(edge) + abs(dot(a2, v2 - v0)));
+    vec3 a1 = safe_normalize(cross(a0, side));
+    vec3 a2 = -cross(a1, a0);
+    float size = 0.5 * (sqrt(max(dot(edge, edge), SAFE_NORM2)) + abs(dot(a2, side)));
     return TriangleFrame((v0 + v1 + v2) / 3.0, mat3(a0, a1, a2), size);
 }
