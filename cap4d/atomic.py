@@ -10,7 +10,7 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, for the body to write; it takes the name `path` when the body ends well.
+    """A temporary path beside `path`, for the body to write; it becomes `path` when the body ends well.
 
     When the body raises (Ctrl-C too), the temporary file goes and `path` is as it was.
     """

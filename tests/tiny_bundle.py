@@ -1,9 +1,8 @@
-"""A complete bundle made of almost nothing: a ball with a face-like parametrisation, for tests of players and files."""
+"""A complete bundle made of almost nothing: a ball that talks, for tests of players and files."""
 
 from __future__ import annotations
 
 import numpy as np
-
 from cap4d.bundle import Bundle
 from cap4d.camera import orbit_camera
 from cap4d.drive.clip import Clip
@@ -161,7 +160,7 @@ def tiny_bundle(
         deform_neutral=np.ascontiguousarray(deform_neutral),
         deform_onnx=onnx,
         means=rng.uniform(-0.4, 0.4, (n, 3)).astype(np.float32),
-        quats=(rng.normal(size=(n, 4)) + [2, 0, 0, 0]).astype(np.float32),
+        quats=rng.normal([2, 0, 0, 0], 1, (n, 4)).astype(np.float32),
         log_scales=rng.uniform(-1.5, -0.5, (n, 3)).astype(np.float32),
         opacity_logits=rng.uniform(0, 4, n).astype(np.float32),
         sh=sh.astype(np.float32),

@@ -1,4 +1,4 @@
-"""The `.cap4d` file: one avatar, everything a player needs and nothing else. FORMAT.md is its specification."""
+"""The `.cap4d` file: one avatar, all that a player needs and nothing else. FORMAT.md specifies it."""
 
 from cap4d.bundle.bundle import Bundle
 from cap4d.bundle.inspect import describe

@@ -1,4 +1,4 @@
-"""A fitted avatar as a player needs it, in memory. Files are reader.py's and writer.py's; FORMAT.md specifies them."""
+"""A fitted avatar as a player needs it, in memory. Files: reader.py, writer.py, FORMAT.md."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class Bundle:
         expression_range: float32[E, 2] useful values.
         grid: The rig's UV grid.
         subject: The head on the G grid vertices, rig axes; float32.
-        deform_neutral: float32[G, 3] m, head frame, OpenCV axes: the deformer's output at the neutral expression.
-        deform_onnx: Network `offsets` float32[1, 3, S, S] m -> `deformation` float32[1, 3, S, S] m, with scaling, masks
-            and positional encoding inside (facts 20-23); None: the deformation does not depend on the expression.
-        means, quats, log_scales, opacity_logits, sh: float32 [N, 3], [N, 4], [N, 3], [N], [N, (degree + 1)^2, 3]: raw
-            Gaussians in the local frames of their triangles (facts 26, 27).
+        deform_neutral: float32[G, 3] m, head frame, OpenCV axes: the network's answer to no offsets.
+        deform_onnx: Network `offsets` float32[1, 3, S, S] m -> `deformation` float32[1, 3, S, S] m, with scaling,
+            masks and positional encoding inside (facts 20-23); None: expressions move nothing beyond the rig.
+        means, quats, log_scales, opacity_logits, sh: float32 [N, 3], [N, 4], [N, 3], [N], [N, (degree + 1)^2, 3]:
+            raw Gaussians in the local frames of their triangles (facts 26, 27).
         binding: int32[N] into `grid.faces`.
         camera: Default view of the head-fixed world.
         idle: What plays when nothing drives the avatar.
         preview: PNG.
-        mesh_subject: The head on all V vertices of the rig, if known: `subject` is then exactly its mixture by
-            `grid.vertices` and `grid.bary`, and a file stores whichever is smaller.
+        mesh_subject: The head on all V vertices of the rig, if known: `subject` is then exactly its mixture
+            by `grid.vertices` and `grid.bary`, and a file stores whichever is smaller.
         rig_vertices: V; filled in from `mesh_subject`, or else the least that `grid.vertices` allows.
     """
 

@@ -1,7 +1,7 @@
 """The outer shell of a `.cap4d` file: a zip archive of stored entries, and nothing else a zip archive may be.
 
-Own reader of a strict subset instead of `zipfile`: no compression (so no bombs), no encryption, no zip64, no data
-descriptors, no comment, no overlap, and only names that the format knows (so no `..`). See FORMAT.md, section 1.
+Own reader of a strict subset instead of `zipfile`: no compression (so no bombs), no encryption, no zip64, no
+data descriptors, no comment, no overlap, and only names that the format knows (so no `..`). See FORMAT.md.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from cap4d.rig.head import JOINT_DRIVERS
 MAX_NAME = 64  # characters of rig, licence and expression names
 MAX_PIXELS = 16384  # of a camera's side
 POINTS = ("grid", "mesh")
-"""Whether the rig's tensors stand on the grid's vertices, or on the rig's and are to be mixed by the reader."""
+"""Whether the rig's tensors stand on the grid's vertices, or on the rig's, for the reader to mix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class Manifest:
         """Reads a manifest.
 
         Raises:
-            DataError: It is not JSON, of another format or version, or a field is missing, unknown or out of range.
+            DataError: Not JSON, of another format or version, or a field is missing, unknown or out of range.
         """
         where = f"{source}:{MANIFEST}"
         fields = _Fields(where, "", _parse(data, where))

@@ -1,6 +1,6 @@
 """Stores an ONNX network's weights as float16, each followed by a Cast back to float32.
 
-Half the bytes in the file; the arithmetic stays float32 (a runtime folds the casts away when it loads the network).
+Half the bytes in the file; the arithmetic stays float32 (a runtime folds the casts away as it loads).
 Only writing needs this, and only this needs the `onnx` package.
 """
 

@@ -1,4 +1,4 @@
-"""Checks that bytes are a PNG of sane size, without decoding it (no decoder sees a preview unless somebody looks at it)."""
+"""Checks that bytes are a PNG of sane size, without decoding it: no decoder sees a preview unasked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a `.cap4d` file may hold: entries, tensors, counts and their limits, as tables. FORMAT.md says it in words."""
+"""What a `.cap4d` file may hold: entries, tensors, counts and their limits, as tables. FORMAT.md is the prose."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ class TensorSpec:
 
     Args:
         shape: Sizes: a number, or a symbol of `SYMBOLS`, or `9J`.
-        kind: `float` is float32; `packed` is float32, or float16 in the float16 form; `index` is the smallest of
-            uint16 and uint32 that holds indices `below`; `flag` is uint8, 0 or 1.
+        kind: `float` is float32; `packed` is float32, or float16 in the float16 form; `index` is the smaller
+            of uint16 and uint32 that holds indices `below`; `flag` is uint8, 0 or 1.
         low, high: Inclusive limits of float values.
         below: Symbol of the count that indices stay under.
     """
@@ -175,7 +175,7 @@ def _check_tensor(
 
 
 def check_relations(source: str, tensors: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Checks what no single tensor shows: order, duplicates, sums, norms. Call after `check_tensors` of every entry.
+    """Checks what no single tensor shows: order, duplicates, sums, norms. Call after `check_tensors`.
 
     Raises:
         DataError: As above.

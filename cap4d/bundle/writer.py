@@ -144,7 +144,7 @@ def _grid_tensors(bundle: Bundle) -> dict[str, np.ndarray]:
 def _as_stored(
     entry: str, arrays: dict[str, np.ndarray], counts: dict[str, int], precision: str
 ) -> dict[str, np.ndarray]:
-    """The arrays in the file's dtypes. Values that a dtype cannot hold stay as they are, for the checks to name."""
+    """The arrays in the file's dtypes. Indices that a dtype cannot hold stay, for the checks to name."""
     stored = {}
     for name, array in arrays.items():
         dtype = stored_dtype(TENSORS[entry][name], counts, precision)

@@ -1,4 +1,4 @@
-"""FlowFace sequences: the `fit.npz` that trackers write and the released CAP4D animates from (facts 41, 46)."""
+"""FlowFace sequences: the `fit.npz` that trackers write and CAP4D animates from (facts 41, 46)."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ FLAME_EXPRESSIONS = 65  # of a sequence that names no rig (fact 3)
 def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
     """The expressions, gaze, neck and head pose of a fit.npz, for the avatar whose rig they belong to.
 
-    The identity in it is left aside: expressions are transferred as they are (fact 46). A file without `rig_name` is a
-    FLAME sequence of the released system.
+    The identity in it is left aside: expressions are transferred as they are (fact 46). A file without `rig_name`
+    is a FLAME sequence of the released system.
 
     Raises:
         DataError: Not sound, or of another rig.

@@ -1,8 +1,8 @@
 """Mesh vertices -> an avatar's expressions: ridge least squares against its own blendshapes (fact 52).
 
-What a mesh sequence does not say cannot be recovered: expressions that no seen vertex shows (whatever moves the mouth's
-inside only), gaze where the source's eyeballs stand still, and how the head moves. What the blendshapes cannot say
-stays in the residual.
+What a mesh sequence does not say cannot be recovered: expressions that no seen vertex shows (whatever moves the
+mouth's inside only), gaze where the source's eyeballs stand still, and how the head moves. What the blendshapes
+cannot say stays in the residual.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RIGID = 0.99  # a skin weight from which a point moves with the eyeball alone
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """T frames: `expr` float32[T, E], `eye_rot` float32[T, 3] rad, `residual_mm` float32[T] root mean square."""
+    """T frames: `expr` float32[T, E], `eye_rot` float32[T, 3] rad, `residual_mm` float32[T] RMS."""
 
     rig_name: str
     expr: np.ndarray
@@ -91,7 +91,7 @@ class Retargeter:
         return expr, self._gaze(vertices, template, expr), residual_mm
 
     def _gaze(self, vertices: np.ndarray, template: np.ndarray, expr: np.ndarray) -> np.ndarray:
-        """[T, 3] the rotation that both eyeballs share (fact 5), by Kabsch's method about each one's own centre."""
+        """[T, 3] the rotation that both eyeballs share (fact 5): Kabsch, about each one's own centre."""
         if not self._eyes:
             return np.zeros((len(vertices), 3), np.float32)
         covariance = np.zeros((len(vertices), 3, 3))

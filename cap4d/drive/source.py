@@ -1,4 +1,4 @@
-"""What `--drive` names, opened: every source of expressions becomes a Clip in the avatar's own expression space."""
+"""What `--drive` names, opened: every source becomes a Clip in the avatar's own expression space."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def open_source(
         spec: None, the avatar's idle clip; `*.npz`, a FlowFace sequence (facts 41, 46); `*.npy`, vertices as
             CodeTalker and VOCA write them.
         bundle: The avatar.
-        template: Neutral vertices of an `.npy` (`.npy`, `.npz` with key `template`, or `.obj`); without it the first
-            frame is taken for neutral.
+        template: Neutral vertices of an `.npy` (`.npy`, `.npz` with key `template`, or `.obj`); without it the
+            first frame is taken for neutral.
         fps: Frames per second, overriding what the source says.
     Raises:
         ArgumentError: No such kind of source.

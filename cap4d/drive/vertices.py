@@ -1,4 +1,4 @@
-"""Sequences of mesh vertices on disk, as speech-driven models write them: CodeTalker and VOCA, on FLAME's topology."""
+"""Sequences of mesh vertices on disk, as CodeTalker and VOCA write them on FLAME's topology."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_TEMPLATE_BYTES = 64 << 20
 
 
 def expected_vertices(bundle: Bundle) -> int:
-    """How many vertices a frame for this avatar has: FLAME's own for a FLAME rig (without CAP4D's mouth, fact 14)."""
+    """Vertices of a frame for this avatar: FLAME's own for a FLAME rig (without CAP4D's mouth, fact 14)."""
     return FLAME_VERTICES if bundle.rig_name.startswith(FLAME) else bundle.rig_vertices
 
 
@@ -40,7 +40,7 @@ def read_vertices(path: Path, count: int) -> np.ndarray:
 
 
 def read_template(path: Path, count: int) -> np.ndarray:
-    """float32[count, 3] m neutral vertices: an .npy, an .npz with key `template`, or the `v` lines of an .obj.
+    """float32[count, 3] m neutral: an .npy, an .npz with key `template`, or the `v` lines of an .obj.
 
     Raises:
         ArgumentError: Another kind of file.

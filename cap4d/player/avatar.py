@@ -1,4 +1,4 @@
-"""A playing avatar: an expression in, posed Gaussians or a picture out. NumPy, onnxruntime and `_core`; no torch."""
+"""A playing avatar: an expression in, posed Gaussians or a picture out. No torch."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Avatar:
 
     Args:
         bundle: The avatar.
-        deformer: `full` (what `auto` means) runs the deformation network; `off` leaves the neutral correction only.
+        deformer: `full` (what `auto` means) runs the network; `off` leaves its neutral correction only.
         threads: For the network and the renderer; 0: see `deformer.default_threads`.
         source: The file it came from, for error messages.
     """
@@ -176,7 +176,7 @@ class Avatar:
         return expr
 
     def _deformation(self, straight: np.ndarray, jaw_rot: np.ndarray | None) -> np.ndarray:
-        """[G, 3] m, OpenCV axes: inside the mask the network's answer, elsewhere its neutral one (fact 24)."""
+        """[G, 3] m, OpenCV axes: in the mask the network's answer, elsewhere its neutral one (fact 24)."""
         bundle = self.bundle
         if self.deformer is None:
             return bundle.deform_neutral

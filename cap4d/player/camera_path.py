@@ -1,4 +1,4 @@
-"""How the camera of an offline render moves: standing, orbiting, or along a file. All in the head-fixed world."""
+"""How the camera of an offline render moves: it stands, orbits, or follows a file. Head-fixed world."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def orbit_path(camera: Camera, target: np.ndarray, *, fps: float) -> CameraPath:
 
 
 def file_path(path: Path, size: tuple[int, int] | None) -> CameraPath:
-    """Cameras of a world in which the driven head moves: a trajectory (fact 46) or a fit.npz (its first camera).
+    """Cameras of a world in which the driven head moves: a trajectory (fact 46) or a fit.npz's first.
 
-    A trajectory gives one camera a frame and starts again at its end; the head's pose is folded into it (fact 31).
+    A trajectory gives one camera a frame and starts again at its end; the head's pose is folded in (fact 31).
 
     Raises:
         ArgumentError: There is no such file.

@@ -13,7 +13,7 @@ MAX_THREADS = 4  # beyond it a batch of one at 128 x 128 gains nothing
 
 
 class Deformer:
-    """A loaded network: expression offsets float32[3, S, S] m -> deformation float32[3, S, S] m (facts 20-24).
+    """A loaded network: offsets float32[3, S, S] m -> deformation float32[3, S, S] m (facts 20-24).
 
     The pass is skipped while the offsets stay the same.
 

@@ -30,7 +30,7 @@ PROGRESS_SECONDS = 2.0  # between lines of progress
 STATS_SCHEMA = 1
 
 Draw = Callable[[Avatar, Frame, Camera], np.ndarray]
-"""(avatar, frame, camera) -> uint8[H, W, 3 | 4], composited. A backend; it times its stages in `avatar.stages`."""
+"""(avatar, frame, camera) -> uint8[H, W, 3 | 4], composited. A backend; times go to `avatar.stages`."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""PNG pictures in memory and on disk, without an image library (the capture side has its own, with OpenImageIO)."""
+"""PNG pictures in memory and on disk without an image library (the capture side has OpenImageIO)."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Stages:
 
 def _percentiles(seconds: deque[float]) -> dict[str, float]:
     median, p95, p99 = np.percentile(np.array(seconds) * 1e3, [50, 95, 99])
-    return {"median_ms": round(median, 3), "p95_ms": round(p95, 3), "p99_ms": round(p99, 3)}
+    return {name: round(float(v), 3) for name, v in (("median_ms", median), ("p95_ms", p95), ("p99_ms", p99))}
 
 
 def peak_memory_mb() -> float:

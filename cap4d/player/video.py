@@ -56,7 +56,7 @@ class VideoWriter:
                     raise error.with_traceback(trace)
 
     def write(self, image: np.ndarray) -> None:
-        """Appends uint8[H, W, 3 | 4]; a video drops alpha, and repeats the last row or column of an odd size."""
+        """Appends uint8[H, W, 3 | 4]; a video drops alpha and pads odd sizes by repeating an edge."""
         if self.path.suffix == ".png":
             self._write_png(image)
         else:
