@@ -1,4 +1,6 @@
-"""Packing texture tiles into one atlas for the UV grid: every tile in a box of its own, the busy parts of a face larger."""
+"""Packing texture tiles into one atlas for the UV grid: every tile in a box of its own, the busy parts of a
+face larger.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ GUTTER = 0.6 / 128  # of the atlas; with it two tiles on a 128 grid are never ne
 
 
 def weld(uvs: np.ndarray, uv_faces: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joins texture vertices that have the same place and the same mesh vertex, so that islands are really islands.
+    """Joins texture vertices that have the same place and the same mesh vertex, so that islands are really
+    islands.
 
     Args:
         uvs, uv_faces, faces: [T, 2], int[F, 3], int[F, 3].
@@ -39,7 +42,9 @@ def islands(uv_faces: np.ndarray, n_uvs: int) -> np.ndarray:
 
 
 def unmirror(uvs: np.ndarray, uv_faces: np.ndarray) -> np.ndarray:
-    """[T, 2] with every island that shows its back (clockwise triangles) mirrored in its own bounding rectangle."""
+    """[T, 2] with every island that shows its back (clockwise triangles) mirrored in its own bounding
+    rectangle.
+    """
     label = islands(uv_faces, len(uvs))
     a, b, c = (uvs[uv_faces[:, corner]] for corner in range(3))
     turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
@@ -61,8 +66,8 @@ def place(uvs: np.ndarray, box: Box, *, gutter: float = GUTTER) -> np.ndarray:
 def enlarge_busy(uvs: np.ndarray, weights: np.ndarray, *, strength: float, bins: int = 64) -> np.ndarray:
     """[T, 2] in [0, 1] warped along u and v so that columns and rows with much weight [T] get more room.
 
-    Each axis is mapped by the integral of (1 - strength) + strength * density of the weights, smoothed; monotone, so
-    nothing folds beyond what single triangles may.
+    Each axis is mapped by the integral of (1 - strength) + strength * density of the weights, smoothed;
+    monotone, so nothing folds beyond what single triangles may.
     """
     warped = np.empty_like(uvs)
     edges = np.linspace(0, 1, bins + 1)
@@ -80,9 +85,9 @@ def add_skirts(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Widens islands by a rim of triangles that have an area in the texture but none in space.
 
-    Where a surface is cut, the last pixel centres of its two islands lie up to a pixel inside the cut, and the grid
-    would have a gap there. A rim pixel is a point of the cut itself. The rim comes last, so a surface always wins
-    over it; less than 0.7 px wide, it never holds all corners of a grid triangle.
+    Where a surface is cut, the last pixel centres of its two islands lie up to a pixel inside the cut, and
+    the grid would have a gap there. A rim pixel is a point of the cut itself. The rim comes last, so a
+    surface always wins over it; less than 0.7 px wide, it never holds all corners of a grid triangle.
 
     Args:
         uvs, uv_faces, faces: [T, 2], int[F, 3], int[F, 3].

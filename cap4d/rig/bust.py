@@ -1,6 +1,7 @@
 """Shoulders and chest under a head that ends at the neck: a smooth surface swept from the neck's open edge.
 
-Nothing anatomical, a place for clothes to hang on: it follows the edge it grows from and moves with the neck joint.
+Nothing anatomical, a place for clothes to hang on: it follows the edge it grows from and moves with the neck
+joint.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ class Bust:
         faces: int32[F, 3] into edge (0..L-1) followed by the rings (L..).
         uvs: float64[T, 2] in [0, 1]; rings along u, cut open at the loop's first vertex.
         uv_faces: int32[F, 3].
-        follow: float64[R L] how much of its edge vertex's own motion each vertex takes over (the rest is the mean's).
+        follow: float64[R L] how much of its edge vertex's own motion each vertex takes over (the rest is the
+            mean's).
     """
 
     vertices: np.ndarray
@@ -35,7 +37,9 @@ class Bust:
     follow: np.ndarray
 
     def continue_offsets(self, edge_offsets: np.ndarray) -> np.ndarray:
-        """[K, L, 3] offsets of the edge -> [K, R L, 3] of the bust: fading from each vertex's own to their mean."""
+        """[K, L, 3] offsets of the edge -> [K, R L, 3] of the bust: fading from each vertex's own to their
+        mean.
+        """
         mean = edge_offsets.mean(1, keepdims=True)
         own = np.tile(edge_offsets - mean, (1, len(self.vertices) // edge_offsets.shape[1], 1))
         return mean + own * self.follow[:, None]
@@ -49,8 +53,8 @@ def grow_bust(edge: np.ndarray, leaving: np.ndarray) -> Bust:
         leaving: [L, 3] direction in which the surface arrives at each edge vertex.
     """
     angle = np.arctan2(edge[:, 0] - edge[:, 0].mean(), edge[:, 2] - BOTTOM_DEPTH)
-    around = np.stack([np.sin(angle) * BOTTOM_AXES[0], 0 * angle, np.cos(angle) * BOTTOM_AXES[1]], 1)
-    bottom = around + [0, -BOTTOM_BELOW_ORIGIN, BOTTOM_DEPTH]
+    x, z = np.sin(angle) * BOTTOM_AXES[0], np.cos(angle) * BOTTOM_AXES[1] + BOTTOM_DEPTH
+    bottom = np.stack([x, np.full_like(x, -BOTTOM_BELOW_ORIGIN), z], 1)
     t = (np.arange(1, N_RINGS + 1) / N_RINGS)[:, None, None]
     start = leaving / np.linalg.norm(leaving, axis=1, keepdims=True) * LEAVE
     end = np.array([0, -ARRIVE, 0])

@@ -1,8 +1,8 @@
 """The UV grid: a rig's surface resampled on a square image, so that a convolution can move it (facts 16-19).
 
-Pixel (row, column) of a grid of S x S is the surface point at v = (row + 0.5) / S, u = 1 - (column + 0.5) / S: the
-texture turned by 180 degrees, as the released system has it. The map from rig vertices to grid vertices is sparse and
-fixed, so blendshapes are evaluated straight on the grid.
+Pixel (row, column) of a grid of S x S is the surface point at v = (row + 0.5) / S, u = 1 - (column + 0.5) /
+S: the texture turned by 180 degrees, as the released system has it. The map from rig vertices to grid
+vertices is sparse and fixed, so blendshapes are evaluated straight on the grid.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class UvGrid:
     Args:
         size: S, pixels a side.
         pixels: int16[G, 2] row and column of each grid vertex, in scan order.
-        faces: int32[M, 3] into the G grid vertices, in the order of fact 18 (Gaussians are bound by face index).
+        faces: int32[M, 3] into the G grid vertices, in the order of fact 18 (Gaussians are bound by face
+            index).
         deformable: bool[G] where the deformation network may move the surface with the expression (fact 19).
         vertices: int32[G, 3] the rig vertices each grid vertex mixes.
         bary: float32[G, 3] their weights.
@@ -67,9 +68,10 @@ class UvGrid:
 def build_grid(rig: HeadRig, size: int = 128) -> UvGrid:
     """The UV grid of a rig.
 
-    For FLAME with CAP4D's avatar template and S = 128 it has the released system's 14,425 grid vertices, 28,120 faces
-    and 8,424 deformable vertices. Two rules go beyond facts 16-19 and change nothing there: where UV islands overlap
-    the lower face index is seen, and no face spans two UV islands (a packed atlas has them a fraction of a pixel apart).
+    For FLAME with CAP4D's avatar template and S = 128 it has the released system's 14,425 grid vertices,
+    28,120 faces and 8,424 deformable vertices. Two rules go beyond facts 16-19 and change nothing there:
+    where UV islands overlap the lower face index is seen, and no face spans two UV islands (a packed atlas
+    has them a fraction of a pixel apart).
 
     Args:
         rig: Any rig with UVs.
@@ -80,7 +82,9 @@ def build_grid(rig: HeadRig, size: int = 128) -> UvGrid:
     if not 2 <= size <= 4096:
         raise ArgumentError(f"size: expected 2 to 4096 px, got {size}")
     if not len(rig.uv_faces):
-        raise ArgumentError(f"{rig.name}: expected a rig with UVs for a grid, got one without")
+        raise ArgumentError(
+            f"{rig.name}: a UV grid needs a rig with UVs (FLAME has them when imported with --assets)"
+        )
     seen, bary = _rasterize_uvs(rig, size)
     valid = seen >= 0
     pixels = np.argwhere(valid)
@@ -105,14 +109,18 @@ def remesh(model: Model, grid: UvGrid) -> Model:
 
 
 def _rasterize_uvs(rig: HeadRig, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """int32[S, S] the face at each pixel centre or -1, float64[S, S, 3] barycentrics. Mirrored faces are not seen."""
+    """int32[S, S] the face at each pixel centre or -1, float64[S, S, 3] barycentrics. Mirrored faces are not
+    seen.
+    """
     u, v = rig.uvs.astype(np.float64).T
     xyz = np.stack([(1 - u) * size, v * size, np.zeros_like(u)], -1)
     return _core.rasterize_mesh(xyz, np.ascontiguousarray(rig.uv_faces, np.int32), size, size, "clockwise")
 
 
 def _grid_faces(island: np.ndarray) -> np.ndarray:
-    """int32[M, 3]: two triangles per 2x2 cell, where all corners are on one island; columns outer, rows inner (fact 18)."""
+    """int32[M, 3]: two triangles per 2x2 cell, where all corners are on one island; columns outer, rows inner
+    (fact 18).
+    """
     valid = island >= 0
     index = np.cumsum(valid).reshape(valid.shape) - 1
     rows, columns = np.arange(island.shape[0] - 1), np.arange(island.shape[1] - 1)

@@ -1,8 +1,9 @@
 """ICT-FaceKit Light (Li et al. 2020) as a HeadRig: metres, joints, one atlas, shoulders, colours.
 
-Vertices 0 to 24590 keep ICT's numbering; lacrimal fluid, eye blend, occlusion shells and eyelashes after them are left
-out and the shoulders take their place. The inner iris layers and the backs of the eyeballs keep their vertices but have
-no faces. Expression names are the files' own: ARKit's with _L and _R. The origin is where FLAME has it, judged by the
+Vertices 0 to 24590 keep ICT's numbering; lacrimal fluid, eye blend, occlusion shells and eyelashes after them
+are left out and the shoulders take their place. The inner iris layers and the backs of the eyeballs keep
+their vertices but have no faces. Expression names are the files' own: ARKit's with _L and _R. The origin is
+where FLAME has it, judged by the
 eyes: they lie 23 mm above it and 6 mm in front.
 """
 
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cap4d.rig import ict_paint as paint
+from cap4d.rig import paint
 from cap4d.rig.atlas import add_skirts, enlarge_busy, islands, place, unmirror, weld
 from cap4d.rig.bust import grow_bust, open_edge
 from cap4d.rig.head import HeadRig
@@ -37,12 +38,15 @@ RANGES = {
 }
 
 # The 68 Multi-PIE landmarks as vertices (the model's `idx_to_landmark_verts`).
-LANDMARKS = np.array(
-    """1225 1888 1052 367 1719 1722 2199 1447 966 3661 4390 3927 3924 2608 3272 4088 3443 268 493 1914 2044 1401 3615 4240
-    4114 2734 2509 978 4527 4942 4857 1140 2075 1147 4269 3360 1507 1542 1537 1528 1518 1511 3742 3751 3756 3721 3725 3732
-    5708 5695 2081 0 4275 6200 6213 6346 6461 5518 5957 5841 5702 5711 5533 6216 6207 6470 5517 5966""".split(),
-    np.int32,
-)
+# fmt: off
+LANDMARKS = np.array([
+    1225, 1888, 1052, 367, 1719, 1722, 2199, 1447, 966, 3661, 4390, 3927, 3924, 2608, 3272, 4088, 3443,
+    268, 493, 1914, 2044, 1401, 3615, 4240, 4114, 2734, 2509, 978, 4527, 4942, 4857, 1140, 2075, 1147,
+    4269, 3360, 1507, 1542, 1537, 1528, 1518, 1511, 3742, 3751, 3756, 3721, 3725, 3732, 5708, 5695,
+    2081, 0, 4275, 6200, 6213, 6346, 6461, 5518, 5957, 5841, 5702, 5711, 5533, 6216, 6207, 6470, 5517,
+    5966,
+], np.int32)
+# fmt: on
 
 # Where each tile lies in the atlas, in pixels of a 128 grid: u0, v0, u1, v1. Most of it is face.
 BOXES = {
@@ -136,7 +140,9 @@ def _in_range(ids: np.ndarray, part: str) -> np.ndarray:
 
 
 def _mesh(model: IctModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles of the parts that are kept, their texture in the atlas, and text[T] the tile of each texture vertex."""
+    """Triangles of the parts that are kept, their texture in the atlas, and text[T] the tile of each texture
+    vertex.
+    """
     faces, uv_faces = triangulate(model.faces, model.uv_faces)
     parts = _part_of_faces(faces, model.uvs[uv_faces].mean(1))
     kept = parts >= 0
@@ -155,7 +161,7 @@ def _mesh(model: IctModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _part_of_faces(faces: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """int[F] index into RANGES, or -1 for faces that are left out. `centres` [F, 2] are in the model's UVs."""
+    """int[F] index into RANGES, -1 for faces that are left out. `centres` [F, 2] are in the model's UVs."""
     parts = np.full(len(faces), -1)
     for index, part in enumerate(RANGES):
         parts[_in_range(faces[:, 0], part)] = index
@@ -166,7 +172,9 @@ def _part_of_faces(faces: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def _tile_of_uvs(uvs: np.ndarray, uv_faces: np.ndarray, parts: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """text[T] the tile of each texture vertex: the part that most faces of its island belong to; sockets by side."""
+    """text[T] the tile of each texture vertex: the part that most faces of its island belong to; sockets by
+    side.
+    """
     label = islands(uv_faces, len(uvs))
     votes = np.zeros((len(uvs), len(RANGES)))
     np.add.at(votes, (label[uv_faces[:, 0]], parts), 1)
@@ -230,7 +238,9 @@ def _ball_centre(points: np.ndarray) -> np.ndarray:
 
 
 def _affine_regressor(points: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """[V] smallest weights that sum to 1 and mix `points` to `target`: it follows any affine motion of the points."""
+    """[V] smallest weights that sum to 1 and mix `points` to `target`: it follows any affine motion of the
+    points.
+    """
     system = np.column_stack([points, np.ones(len(points))])
     return np.linalg.pinv(system).T @ np.append(target, 1.0)
 

@@ -25,7 +25,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class IctModel:
-    """float32 `neutral` [V, 3], `identity` [S, V, 3] and `expression` [E, V, 3] offsets, cm; quads as in `ObjMesh`."""
+    """float32 `neutral` [V, 3], `identity` [S, V, 3] and `expression` [E, V, 3] offsets, cm; quads as in
+    `ObjMesh`.
+    """
 
     neutral: np.ndarray
     uvs: np.ndarray

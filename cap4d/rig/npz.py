@@ -1,4 +1,6 @@
-"""NumPy archives from outside: plain arrays only, every size checked before it is believed. Errors are one-line DataErrors."""
+"""NumPy archives from outside: plain arrays only, every size checked before it is believed. Errors are
+one-line DataErrors.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an .npz file.
 
     Raises:
-        DataError: Not an archive, damaged, with objects in it, or with a member whose header and size disagree.
+        DataError: Not an archive, damaged, with objects in it, or with a member whose header and size
+            disagree.
     """
     path = Path(path)
     try:

@@ -1,4 +1,4 @@
-"""Wavefront OBJ as head models use it: vertices, texture vertices, triangles and quads. Nothing else is read."""
+"""Wavefront OBJ as head models use it: vertices, texture vertices, triangles, quads. The rest is skipped."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ MAX_BYTES = 1 << 28
 
 @dataclass(frozen=True, eq=False)
 class ObjMesh:
-    """float64 `vertices` [V, 3] and `uvs` [T, 2]; int32 `faces` and `uv_faces` [F, 4], -1 in column 3 of a triangle."""
+    """float64 `vertices` [V, 3] and `uvs` [T, 2]; int32 `faces` and `uv_faces` [F, 4], -1 in column 3 of a
+    triangle.
+    """
 
     vertices: np.ndarray
     uvs: np.ndarray
@@ -45,7 +47,9 @@ def read_obj_vertices(path: Path) -> np.ndarray:
 
 
 def triangulate(quads: np.ndarray, uv_quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[F, 4] quads with -1 in column 3 of triangles -> int32[N, 3] triangles (a, b, c), (a, c, d) and their UV ones."""
+    """[F, 4] quads with -1 in column 3 of triangles -> int32[N, 3] triangles (a, b, c), (a, c, d) and their
+    UV ones.
+    """
     is_quad = np.repeat(quads[:, 3] >= 0, 2)
     is_quad[::2] = True
     halves = [0, 1, 2], [0, 2, 3]

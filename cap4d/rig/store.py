@@ -1,4 +1,6 @@
-"""Head rigs on disk: one .npz of plain arrays (text as NumPy strings), no pickle. The only place that knows the layout."""
+"""Head rigs on disk: one .npz of plain arrays (text as NumPy strings), no pickle. The only place that knows
+the layout.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from cap4d.rig.npz import checked, checked_indices, read_npz, write_npz
 
 FORMAT = "cap4d-rig 1"
 
-# Shapes by letter: V vertices, F faces, T texture vertices, S identity modes, E expressions, J joints. A letter is
-# bound by the first array that has it.
+# Shapes by letter: V vertices, F faces, T texture vertices, S identity modes, E expressions, J joints. A
+# letter is bound by the first array that has it.
 _FLOATS = {
     "template": "V3",
     "uvs": "T2",
@@ -73,7 +75,7 @@ def load_rig(path: Path) -> HeadRig:
         texts = checked(path, name, arrays.get(name), kind="text", shape=(sizes[letter],))
         values[name] = tuple(texts.tolist())
     values["faces"] = checked_indices(path, "faces", arrays.get("faces"), shape=(None, 3), below=sizes["V"])
-    corners = (len(values["faces"]), 3)
+    corners = (len(values["faces"]) if sizes["T"] else 0, 3)
     values["uv_faces"] = checked_indices(
         path, "uv_faces", arrays.get("uv_faces"), shape=corners, below=sizes["T"]
     )

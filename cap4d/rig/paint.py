@@ -1,4 +1,4 @@
-"""Plain colours for the ICT head, so that pictures of it look like a face (and a face detector agrees)."""
+"""Plain colours for heads, so that pictures of a rig look like a face (and a face detector agrees)."""
 
 from __future__ import annotations
 

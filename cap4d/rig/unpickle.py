@@ -1,0 +1,187 @@
+"""Pickles of head models, read without running them.
+
+A pickle is a program that calls whatever it names. Here each of the few names such files need stands for an
+inert record of ours, and anything else is refused by its name; no module a file names is ever imported. The
+records become NumPy arrays after reading, through `np.frombuffer` alone.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cap4d.errors import DataError
+
+MAX_BYTES = 1 << 30
+
+
+def read_pickle(path: Path) -> dict[str, Any]:
+    """The dictionary in a pickle: arrays (NumPy's, chumpy's, SciPy's sparse ones made dense), text and
+    numbers.
+
+    Raises:
+        DataError: Naming the class or what else is wrong.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise DataError(path, "size", expected=f"at most {MAX_BYTES} bytes", found=path.stat().st_size)
+        with open(path, "rb") as stream:
+            content = _Unpickler(stream, path).load()
+    except OSError as error:
+        raise DataError(path, "file", expected="a pickle", found=error.strerror) from error
+    except _BROKEN as error:
+        raise DataError(path, "pickle", expected="a whole and plain pickle", found=repr(error)) from error
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise DataError(path, "pickle", expected="a dictionary with text keys", found=type(content).__name__)
+    return {key: _plain(path, key, value) for key, value in content.items()}
+
+
+class _Record:
+    """Keeps what a pickle wants to build something from."""
+
+    def __init__(self, *args: Any) -> None:
+        self.args, self.state = args, None
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def __reduce__(self) -> Any:
+        raise TypeError("a record of a pickle is not for pickling")
+
+
+class _Dtype(_Record):
+    pass
+
+
+class _Array(_Record):
+    pass
+
+
+class _Sparse(_Record):
+    pass
+
+
+class _Chumpy(_Record):
+    pass
+
+
+def _encode(text: str, encoding: str) -> bytes:
+    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+        raise ValueError(f"text encoded as {encoding!r}")
+    return text.encode("latin1")
+
+
+def _reconstruct(kind: type, *_: Any) -> _Record:
+    if not (isinstance(kind, type) and issubclass(kind, _Record)):
+        raise TypeError("an object of no known class")
+    return kind()
+
+
+_NAMES: dict[str, Any] = {
+    "numpy.dtype": _Dtype,
+    "numpy.ndarray": _Array,
+    "numpy.core.multiarray._reconstruct": _reconstruct,
+    "numpy._core.multiarray._reconstruct": _reconstruct,
+    "_codecs.encode": _encode,
+    "copy_reg._reconstructor": _reconstruct,
+    "copyreg._reconstructor": _reconstruct,
+    "__builtin__.object": _Record,
+    "builtins.object": _Record,
+    "__builtin__.set": _Record,
+    "builtins.set": _Record,
+    "chumpy.ch.Ch": _Chumpy,
+}
+_NAMES |= {
+    f"scipy.sparse.{module}.{kind}_matrix": _Sparse
+    for kind in ("csc", "csr")
+    for module in (kind, f"_{kind}")
+}
+
+_BROKEN = (
+    pickle.UnpicklingError,
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    ImportError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, stream, path: Path) -> None:
+        super().__init__(stream, encoding="latin1")
+        self._path = path
+
+    def find_class(self, module: str, name: str) -> Any:
+        full_name = f"{module}.{name}"
+        if full_name not in _NAMES:
+            raise DataError(
+                self._path, "pickle", expected="NumPy, SciPy or chumpy arrays only", found=full_name
+            )
+        return _NAMES[full_name]
+
+
+def _plain(path: Path, key: str, value: Any) -> Any:
+    try:
+        if isinstance(value, _Chumpy):
+            value = value.state["x"]
+        if isinstance(value, _Array):
+            return _array(value)
+        if isinstance(value, _Sparse):
+            return _dense(value)
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
+        raise DataError(path, key, expected="an array", found=repr(error)) from error
+    return value if isinstance(value, (str, bytes, int, float)) else None
+
+
+def _array(record: _Array) -> np.ndarray:
+    """NumPy's own state: (version, shape, dtype, is Fortran order, bytes)."""
+    _, shape, dtype, fortran, data = record.state
+    data = data.encode("latin1") if isinstance(data, str) else data
+    element = _element(dtype)
+    if (
+        not isinstance(data, bytes)
+        or math.prod(shape) * element.itemsize != len(data)
+        or min(shape, default=0) < 0
+    ):
+        raise ValueError(f"shape {tuple(shape)} of {element} in {len(data)} bytes")
+    return np.frombuffer(bytearray(data), element).reshape(shape, order="F" if fortran else "C")
+
+
+def _element(record: _Dtype) -> np.dtype:
+    """A number type; NumPy's state of it begins with (version, byte order)."""
+    code, order = str(record.args[0]), str(record.state[1])
+    if not re.fullmatch(r"[fiu][1248]|b1", code) or order not in ("<", ">", "|", "="):
+        raise ValueError(f"elements of type {order}{code}")
+    return np.dtype(order + code)
+
+
+def _dense(record: _Sparse) -> np.ndarray:
+    """A compressed sparse matrix as a dense one: data and indices between indptr[i] and indptr[i + 1] belong
+    to line i.
+    """
+    state = record.state
+    data, indices, indptr = (_array(state[name]) for name in ("data", "indices", "indptr"))
+    shape = tuple(int(n) for n in state.get("_shape", state.get("shape")))
+    by_column = state.get("format", "csc") == "csc"
+    lines, width = shape[::-1] if by_column else shape
+    if not 0 < lines * width <= MAX_BYTES // 8 or len(indptr) != lines + 1:
+        raise ValueError(f"sparse matrix of shape {shape}")
+    counts = np.diff(indptr.astype(np.int64))
+    if (counts < 0).any() or indptr[0] != 0 or indptr[-1] != len(data) or len(indices) != len(data):
+        raise ValueError("sparse matrix with bad line starts")
+    if len(indices) and not 0 <= indices.min() <= indices.max() < width:
+        raise ValueError("sparse matrix with an index out of range")
+    dense = np.zeros((lines, width))
+    np.add.at(dense, (np.repeat(np.arange(lines), counts), indices), data)
+    return dense.T if by_column else dense
