@@ -1,22 +1,23 @@
 """Mesh vertices -> an avatar's expressions: ridge least squares against its own blendshapes (fact 52).
 
-What a mesh sequence does not say cannot be recovered: expressions that no seen vertex shows (whatever moves the
-mouth's inside only), gaze where the source's eyeballs stand still, and how the head moves. What the blendshapes
+What a mesh sequence does not say cannot be recovered: expressions that no seen vertex shows (whatever moves only
+the mouth's inside), gaze where the source's eyeballs stand still, and how the head moves. What the blendshapes
 cannot say stays in the residual.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cap4d.bundle.bundle import Bundle
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError
+from cap4d.rig.head import Subject
 from cap4d.rotation import rotmat_to_axis_angle
 
-NOISE = 1e-4  # m per coordinate: motion below it is not worth an expression of 1 (the ridge)
+NOISE = 3e-5  # m per coordinate: motion below it is not worth an expression of 1 (the ridge)
 MIN_EYE_POINTS = 20
 MIN_GAZE = 2e-3  # rad; below it the eyeballs stand still
 CHUNK = 64  # frames at a time, to bound memory
@@ -63,7 +64,8 @@ class Retargeter:
                 f"vertices: expected a mesh that covers the avatar's, got {still.sum()} points of it"
             )
         self._vertices, self._bary = grid.vertices[still], grid.bary[still]
-        self._basis = subject.expression_basis[:, still].reshape(bundle.n_expressions, -1)
+        self._subject = _points_of(subject, still)
+        self._basis = self._subject.expression_basis.reshape(bundle.n_expressions, -1)
         normal = self._basis.astype(np.float64) @ self._basis.T.astype(np.float64)
         normal += noise**2 * np.eye(len(normal))
         self._expr_from_motion = np.linalg.solve(normal, self._basis.astype(np.float64)).astype(np.float32)
@@ -86,9 +88,13 @@ class Retargeter:
     def _chunk(self, vertices: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         motion = _mix(vertices - template, self._vertices, self._bary).reshape(len(vertices), -1)
         expr = motion @ self._expr_from_motion.T
+        eye_rot = self._gaze(vertices, template, expr)
+        if eye_rot.any():  # lids follow the eyes without an expression: take that motion away and solve again
+            with_gaze, without = self._subject.pose(expr, eye_rot=eye_rot), self._subject.pose(expr)
+            motion = motion - (with_gaze - without).reshape(motion.shape)
+            expr = motion @ self._expr_from_motion.T
         left = (motion - expr @ self._basis).reshape(len(vertices), -1, 3)
-        residual_mm = 1e3 * np.sqrt((left**2).sum(-1).mean(-1))
-        return expr, self._gaze(vertices, template, expr), residual_mm
+        return expr, eye_rot, 1e3 * np.sqrt((left**2).sum(-1).mean(-1))
 
     def _gaze(self, vertices: np.ndarray, template: np.ndarray, expr: np.ndarray) -> np.ndarray:
         """[T, 3] the rotation that both eyeballs share (fact 5): Kabsch, about each one's own centre."""
@@ -112,6 +118,17 @@ class _EyePoints:
     vertices: np.ndarray
     bary: np.ndarray
     basis: np.ndarray
+
+
+def _points_of(subject: Subject, mask: np.ndarray) -> Subject:
+    """The subject on some of its points."""
+    changes = {
+        name: getattr(subject, name)[..., mask, :] for name in ("neutral", "expression_basis", "skin_weights")
+    }
+    for name in ("pose_basis", "pose_offset"):
+        if getattr(subject, name) is not None:
+            changes[name] = getattr(subject, name)[..., mask, :]
+    return replace(subject, **changes)
 
 
 def _eyeballs(drivers: tuple[str, ...], weights: np.ndarray, covered: np.ndarray) -> list[np.ndarray]:
