@@ -15,7 +15,7 @@ from safetensors.numpy import load, save
 
 
 class Forge:
-    """A bundle in pieces: `entries` (bytes by name, without the manifest) and the `manifest` as a dictionary."""
+    """A bundle in pieces: `entries` (bytes by name) and the `manifest` as a dictionary."""
 
     def __init__(self, path: Path) -> None:
         with zipfile.ZipFile(path) as archive:

@@ -22,10 +22,10 @@ class Bundle:
         grid: The rig's UV grid.
         subject: The head on the G grid vertices, rig axes; float32.
         deform_neutral: float32[G, 3] m, head frame, OpenCV axes: the network's answer to no offsets.
-        deform_onnx: Network `offsets` float32[1, 3, S, S] m -> `deformation` float32[1, 3, S, S] m, with scaling,
-            masks and positional encoding inside (facts 20-23); None: expressions move nothing beyond the rig.
-        means, quats, log_scales, opacity_logits, sh: float32 [N, 3], [N, 4], [N, 3], [N], [N, (degree + 1)^2, 3]:
-            raw Gaussians in the local frames of their triangles (facts 26, 27).
+        deform_onnx: Network `offsets` float32[1, 3, S, S] m -> `deformation`, the same, with scaling, masks
+            and positional encoding inside (facts 20-23); None: expressions move nothing beyond the rig.
+        means, quats, log_scales, opacity_logits, sh: float32 [N, 3], [N, 4], [N, 3], [N] and
+            [N, (degree + 1)^2, 3]: raw Gaussians in the local frames of their triangles (facts 26, 27).
         binding: int32[N] into `grid.faces`.
         camera: Default view of the head-fixed world.
         idle: What plays when nothing drives the avatar.

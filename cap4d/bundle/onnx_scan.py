@@ -24,10 +24,11 @@ ITEM_BYTES = {FLOAT: 4, 2: 1, 3: 1, 6: 4, 7: 8, 9: 1, FLOAT16: 2}  # + uint8, in
 # What a network on images is made of. No control flow, no random numbers, no files, strings or sequences, and
 # nothing whose output size is a number in the file (Tile, Range, ConstantOfShape, Resize).
 _OPERATOR_NAMES = """
-    Abs Add AveragePool BatchNormalization Cast CastLike Clip Concat Constant Conv ConvInteger ConvTranspose Cos
-    DequantizeLinear Div DynamicQuantizeLinear Elu Erf Exp Expand Flatten Floor Gather Gelu Gemm
-    GlobalAveragePool GroupNormalization HardSigmoid Identity InstanceNormalization LayerNormalization LeakyRelu
-    Log MatMul MatMulInteger Max MaxPool Mean Min Mul Neg Pad Pow PRelu QLinearConv QLinearMatMul QuantizeLinear
+    Abs Add AveragePool BatchNormalization Cast CastLike Clip Concat Constant Conv ConvInteger ConvTranspose
+    Cos DequantizeLinear Div DynamicQuantizeLinear Elu Erf Exp Expand Flatten Floor Gather Gelu Gemm
+    GlobalAveragePool GroupNormalization HardSigmoid Identity InstanceNormalization LayerNormalization
+    LeakyRelu Log MatMul MatMulInteger Max MaxPool Mean Min Mul Neg Pad Pow PRelu QLinearConv QLinearMatMul
+    QuantizeLinear
     Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum ReduceSumSquare Relu Reshape Shape Sigmoid Sin Slice
     Softplus Split Sqrt Squeeze Sub Sum Tanh Transpose Unsqueeze Where
 """
@@ -50,7 +51,7 @@ class OnnxSummary:
 
 
 def scan_onnx(data: bytes, *, source: str, size: int) -> OnnxSummary:
-    """Checks that `data` is a self-contained network: `offsets` float32[1, 3, size, size] -> `deformation`, same.
+    """Checks that `data` is a self-contained network, float32[1, 3, size, size] in and out.
 
     Raises:
         DataError: It is not, or uses anything beyond plain operators.

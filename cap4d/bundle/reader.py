@@ -1,7 +1,7 @@
 """`.cap4d` file -> Bundle. Nothing in it is believed before it is checked, and nothing is ever run.
 
-Order: container, manifest, then per entry size, hash and content. Every failure is a DataError of one line that
-names `file:entry`, the field, what was expected and what was found.
+Order: container, manifest, then per entry size, hash and content. Every failure is a DataError of one
+line that names `file:entry`, the field, what was expected and what was found.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a `.cap4d` file may hold: entries, tensors, counts and their limits, as tables. FORMAT.md is the prose."""
+"""What a `.cap4d` file may hold: entries, tensors, counts and limits, as tables. FORMAT.md is the prose."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ FLAME_EXPRESSIONS = 65  # of a sequence that names no rig (fact 3)
 def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
     """The expressions, gaze, neck and head pose of a fit.npz, for the avatar whose rig they belong to.
 
-    The identity in it is left aside: expressions are transferred as they are (fact 46). A file without `rig_name`
-    is a FLAME sequence of the released system.
+    The identity in it is left aside: expressions are transferred as they are (fact 46). A file without
+    `rig_name` is a FLAME sequence of the released system.
 
     Raises:
         DataError: Not sound, or of another rig.

@@ -1,8 +1,8 @@
 """Mesh vertices -> an avatar's expressions: ridge least squares against its own blendshapes (fact 52).
 
-What a mesh sequence does not say cannot be recovered: expressions that no seen vertex shows (whatever moves only
-the mouth's inside), gaze where the source's eyeballs stand still, and how the head moves. What the blendshapes
-cannot say stays in the residual.
+What a mesh sequence does not say cannot be recovered: expressions that no seen vertex shows (whatever moves
+only the mouth's inside), gaze where the source's eyeballs stand still, and how the head moves. What the
+blendshapes cannot say stays in the residual.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def open_source(
         spec: None, the avatar's idle clip; `*.npz`, a FlowFace sequence (facts 41, 46); `*.npy`, vertices as
             CodeTalker and VOCA write them.
         bundle: The avatar.
-        template: Neutral vertices of an `.npy` (`.npy`, `.npz` with key `template`, or `.obj`); without it the
+        template: Neutral vertices of an `.npy`: `.npy`, `.npz` with key `template`, or `.obj`; without it the
             first frame is taken for neutral.
         fps: Frames per second, overriding what the source says.
     Raises:

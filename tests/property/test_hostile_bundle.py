@@ -345,7 +345,8 @@ def header(text: str, data: bytes = b"") -> bytes:
     return struct.pack("<Q", len(text)) + text.encode() + data
 
 
-OVERLAP = '{"a":{"dtype":"F32","shape":[1],"data_offsets":[0,4]},"b":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}'
+ONE = '{"dtype":"F32","shape":[1],"data_offsets":[0,4]}'
+OVERLAP = f'{{"a":{ONE},"b":{ONE}}}'
 
 
 @pytest.mark.parametrize(
