@@ -16,7 +16,7 @@ from cap4d.rig.builtin.sheet import Mesh, smoothstep
 from cap4d.rig.builtin.skin import CORNER, CORNER_COLUMN, LIP_ROWS, OUTER_COLUMN, azimuths, row_of
 
 HINGE = np.array([0.0, -4.0, -4.0])  # the jaw's joint, just in front of the ears
-JAW_OPEN = np.radians(19.0)
+JAW_OPEN = np.radians(17.5)
 LIP_LINE = -53.5
 
 
@@ -148,7 +148,7 @@ def _below(p: np.ndarray, row: np.ndarray, theta: np.ndarray, skin: np.ndarray) 
     width = 7 + 0.75 * beyond
     line = LIP_LINE - 0.5 - 0.02 * beyond
     slope = smoothstep(-width, width, line - p[:, 1])
-    at_corner = smoothstep(0.45, 1.0, theta / CORNER)
+    at_corner = 1 - np.maximum(1 - np.minimum(theta / CORNER, 1) ** 2.2, 0) ** 0.75
     opening = (row >= row_of("upper_vermilion") - 8) & (row <= row_of("chin"))
     step = np.where(opening, lower, slope)
     return at_corner * slope + (1 - at_corner) * step
@@ -170,7 +170,7 @@ def _lids(p, row, column, skin, grid):
     angle = np.arctan2(arm[:, 1], arm[:, 2])
     in_eye = skin & (column > CORNER_COLUMN) & (column < OUTER_COLUMN)
     lid = np.where(in_eye & (row <= upper) & (row > row_of("hair")), 1, 0) - np.where(in_eye & (row >= lower) & (row < row_of("nose")), 1, 0)
-    top, bottom = np.radians(88.0), np.radians(-80.0)
+    top, bottom = np.radians(50.0), np.radians(-48.0)
     share = np.where(
         lid > 0,
         np.clip(1 - (angle - angle_u[at]) / (top - angle_u[at]), 0, 1) ** 1.35,
@@ -245,12 +245,12 @@ def mouth_close(f: Face) -> np.ndarray:
     rows = f.mesh.marks["row"]
     reach_low = smoothstep(row_of("chin") - 1, row_of("lower_vermilion") - 3, rows)
     reach_up = smoothstep(row_of("nose") + 1, row_of("upper_vermilion") + 2, rows)
-    theta = azimuths()[np.clip(f.mesh.marks["column"], 0, len(azimuths()) - 1).astype(int)]
-    lateral = smoothstep(CORNER + 8, CORNER - 6, theta)
     gap = _column_gap(f, opened)
-    up = -0.62 * gap * (f.below * reach_low * lateral)[:, None]
-    down = 0.38 * gap * ((1 - f.below) * reach_up * lateral)[:, None]
-    return (up + down) * f.skin[:, None]
+    low = rows >= row_of("lower_lip")
+    rim = smoothstep(row_of("upper_lip") - 5, row_of("upper_lip"), rows) * smoothstep(row_of("lower_lip") + 5, row_of("lower_lip"), rows)
+    lateral = smoothstep(CORNER_COLUMN + 0.5, CORNER_COLUMN - 9, f.mesh.marks["column"])
+    share = np.where(low, -0.62 * reach_low, 0.38 * reach_up) * f.skin * (rim + (1 - rim) * lateral)
+    return share[:, None] * gap
 
 
 def _column_gap(f: Face, offsets: np.ndarray) -> np.ndarray:
@@ -358,7 +358,7 @@ def brow_outer_up(f: Face) -> np.ndarray:
 
 
 def cheek_puff(f: Face) -> np.ndarray:
-    cheeks = f.lump_both((40, -48), (16, 19), (8.0, 0, 7.0))
+    cheeks = f.lump_both((36, -45), (19, 19), (6.5, 0, 7.5))
     return cheeks + f.lump((0, -52), (16, 16), (0, 0, 2.6)) + f.lump_both((21, -54), (9, 9), (-2.4, 0, 1.0))
 
 

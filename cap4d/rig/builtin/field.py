@@ -43,36 +43,37 @@ def carve(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 def head_distance(points: np.ndarray) -> np.ndarray:
     """[N] signed distance (mm, negative inside) of points [N, 3] to the bare head and neck."""
     p = points * 1.0
-    p[:, 0] = np.abs(p[:, 0])
+    p[:, 0] = np.sqrt(p[:, 0] ** 2 + 9)  # |x| without a crease along the midline
     d = ellipsoid(p, (0, 40, -12), (73, 84, 93))  # cranium
     d = melt(d, ellipsoid(p, (0, 52, 22), (60, 50, 64)), 30)  # forehead
-    d = melt(d, ellipsoid(p, (0, -20, 16), (60, 72, 61)), 34)  # midface
+    d = melt(d, ellipsoid(p, (0, -16, 16), (60, 68, 61)), 34)  # midface
     d = melt(d, ellipsoid(p, (42, -8, 42), (22, 20, 24)), 34)  # cheekbone
     d = melt(d, ellipsoid(p, (30, -32, 54), (24, 24, 20)), 30)  # cheek
-    d = melt(d, bone(p, (45, -50, 0), (16, -83, 54), 15, 14), 36)  # jaw
+    d = melt(d, bone(p, (42, -48, 0), (16, -83, 54), 14, 14), 34)  # jaw
     d = melt(d, ellipsoid(p, (0, -54, 52), (34, 30, 35)), 26)  # jaws behind the lips
     d = melt(d, ellipsoid(p, (0, -86, 66), (18, 15, 17)), 22)  # chin
     d = melt(d, bone(p, (12, 41, 74), (44, 38, 56), 8, 7), 22)  # brow ridge
     d = carve(d, ellipsoid(p, (34, 19, 85), (21, 13, 13)), 18)  # eye socket
     d = melt(d, ellipsoid(p, tuple(EYE), (LID_RADIUS,) * 3), 6)  # lids
-    d = melt(d, nose_distance(p), 11)
-    return melt(d, bone(p, (0, -10, -30), (0, -230, -44), 47, 53), 30)  # neck
+    d = melt(d, nose_distance(p), 10)
+    d = melt(d, bone(p, (0, -10, -30), (0, -230, -44), 44, 53), 30)  # neck
+    return melt(d, bone(p, (50, -56, -22), (15, -170, 2), 7, 6), 18)  # the muscle from behind the ear to the throat
 
 
 def nose_distance(p: np.ndarray) -> np.ndarray:
     """[N] distance to the nose: bridge, tip, wings and the column between the nostrils."""
     d = bone(p, (0, 24, 77), (0, -12, 97), 7, 8)
-    d = melt(d, ellipsoid(p, (0, -17, 100), (11, 10, 10)), 10)
-    d = melt(d, ellipsoid(p, (11.5, -22, 89), (7, 6.5, 9)), 7)
+    d = melt(d, ellipsoid(p, (0, -17, 100), (10, 9.5, 9.5)), 10)
+    d = melt(d, ellipsoid(p, (11.8, -22.5, 89), (6.8, 6.4, 9.5)), 7)
     return melt(d, bone(p, (0, -22, 98), (0, -31, 86), 4, 5), 7)
 
 
-def cast(origins: np.ndarray, directions: np.ndarray, start: float = 150.0, steps: int = 28) -> np.ndarray:
+def cast(origins: np.ndarray, directions: np.ndarray, start: float = 150.0, steps: int = 24) -> np.ndarray:
     """[N, 3] the outermost surface points on rays, found by sphere tracing from `start` mm back to the origin."""
     reach = np.full(len(origins), start)
     for _ in range(steps):
-        reach -= 0.9 * head_distance(origins + reach[:, None] * directions)
-    return origins + np.maximum(reach, 0)[:, None] * directions
+        reach -= 0.95 * head_distance(origins + reach[:, None] * directions)
+    return settle(origins + np.maximum(reach, 0)[:, None] * directions, 2)
 
 
 def settle(points: np.ndarray, steps: int = 4) -> np.ndarray:

@@ -33,11 +33,11 @@ def _spot(p: np.ndarray, centre: tuple, size: tuple) -> np.ndarray:
 def brow_share(p: np.ndarray) -> np.ndarray:
     """[N] how much of a point is eyebrow: a band that arches from over the inner corner to the temple and tapers."""
     x = np.abs(p[:, 0])
-    t = np.clip((x - 13.5) / 38, 0, 1)
-    middle = 39.0 + 6.4 * np.sin(np.pi * np.clip(t * 0.92, 0, 1) ** 1.25) - 3.0 * t
-    half = 3.3 * (1 - 0.72 * t**1.6)
-    across = smoothstep(half + 1.2, half - 1.0, np.abs(p[:, 1] - middle))
-    return across * smoothstep(12.0, 16.0, x) * smoothstep(53, 46, x) * (p[:, 2] > 30)
+    t = np.clip((x - 13.0) / 39, 0, 1)
+    middle = 38.6 + 6.6 * np.sin(np.pi * np.clip(t * 0.92, 0, 1) ** 1.2) - 3.0 * t
+    half = 3.4 * (1 - 0.75 * t**1.5) * smoothstep(-0.06, 0.16, (x - 13.0) / 39)
+    across = smoothstep(half + 1.6, half - 1.8, np.abs(p[:, 1] - middle))
+    return across * smoothstep(11.0, 16.5, x) * smoothstep(54, 45, x) * (p[:, 2] > 30)
 
 
 def paint_skin(part: Part) -> Part:
@@ -54,7 +54,7 @@ def paint_skin(part: Part) -> Part:
     c = _blend(c, LIPS, 0.92 * edge * reach)
     seam = np.maximum(smoothstep(upper - 2, upper, row) * (row <= upper), smoothstep(lower + 2, lower, row) * (row >= lower))
     in_mouth = (column <= CORNER_COLUMN) * 1.0
-    c = _blend(c, (0.55, 0.25, 0.25), 0.55 * seam * in_mouth)
+    c = _blend(c, (0.55, 0.25, 0.25), 0.55 * seam * in_mouth * smoothstep(CORNER_COLUMN + 0.5, CORNER_COLUMN - 3, column))
     lip_inside = (depth > 0) & (row >= upper)
     c = _blend(c, LINING, np.where(lip_inside, np.clip(0.25 * depth, 0, 1), 0))
     eye_top, eye_bottom = row_of("upper_lid"), row_of("lower_lid")
@@ -129,5 +129,6 @@ BRUSHES = {
 
 
 def paint(part: Part) -> Part:
-    """The part with its colours."""
-    return BRUSHES[part.name](part)
+    """The part with its colours, on both halves."""
+    painted = BRUSHES[part.name](part)
+    return painted if part.other is None else replace(painted, other=paint(part.other))

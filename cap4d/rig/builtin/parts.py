@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from cap4d.rig.builtin.field import EYE, EYE_RADIUS, cast
@@ -124,46 +126,69 @@ def build_ear() -> Part:
     return grid_part("ear", points, uv, pole=True, ring=True, height=height, rho=r, behind=behind * 1.0)
 
 
-HAIRLINE = ((0, 88), (14, 87), (30, 85), (42, 74), (52, 54), (62, 40), (70, 22), (76, 6), (81, 6), (86, 30), (96, 42), (108, 34), (116, 8), (124, -16), (140, -40), (160, -54), (180, -58))
-THICKNESS = ((0, 15), (30, 14), (50, 9), (70, 5), (84, 5), (110, 8), (140, 9), (180, 9))
+# By azimuth in degrees, for both sides: the hair's edge on the skin, mm.
+HAIRLINE = (
+    *((0, 85), (12, 86), (24, 87), (34, 82), (44, 70), (53, 54), (62, 40), (69, 24), (75, 7), (80, 6), (85, 28)),
+    *((95, 41), (107, 35), (116, 10), (124, -16), (140, -42), (160, -56), (180, -58)),
+)
+# By signed azimuth (positive to the person's left): how far it stands off the skull, mm. Combed from a parting on the left.
+THICKNESS = (
+    *((-180, 8), (-140, 9), (-110, 9), (-84, 6), (-66, 8), (-45, 14), (-22, 22), (0, 21)),
+    *((16, 16), (30, 10), (50, 8), (70, 5.5), (84, 5), (110, 8), (140, 9), (180, 8)),
+)
 
 
 def build_hair() -> Part:
-    """Short combed-back hair: a shell from the crown to the hairline, standing off the skull, its edge under the skin."""
-    theta = np.concatenate([np.linspace(0, 60, 25), np.linspace(60, 180, 41)[1:]])
+    """Short hair combed to the side: a shell from the crown to the hairline, its edge under the skin.
+
+    The only part whose halves differ; they agree on the midline.
+    """
+    left, uv, marks = _hair_half(1)
+    right, _, other = _hair_half(-1)
+    for mine, theirs in ((left, right), *((marks[k], other[k]) for k in marks)):
+        theirs[:, [0, -1]] = mine[:, [0, -1]]
+    part = grid_part("hair", left, uv, pole=True, **marks)
+    mirror = grid_part("hair", right, uv, pole=True, **other)
+    return replace(part, other=mirror)
+
+
+def _hair_half(side: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """[R, C, 3] points (both halves at x >= 0), uv and marks; `side` is 1 for the person's left."""
+    theta = np.concatenate([np.linspace(0, 60, 34), np.linspace(60, 180, 45)[1:]])
     angle = np.radians(theta)
     outward = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
-    line = curve(theta, list(HAIRLINE), soft=2.5)
+    ends = smoothstep(0, 12, theta) * smoothstep(180, 165, theta)
+    line = curve(theta, list(HAIRLINE), soft=2.2) + 0.7 * np.sin(0.9 * theta * side) * ends
     edge = cast(np.stack([0 * line, line, 0 * line], -1), outward)
     centre = np.array([0, 40.0, -12.0])
-    crown = np.array([0, 1.0, -0.25]) / np.hypot(1, 0.25)
+    crown = np.array([0, 1.0, -0.42]) / np.hypot(1, 0.42)
     arm = (edge - centre) / np.linalg.norm(edge - centre, axis=1, keepdims=True)
     full = np.arccos(np.clip(arm @ crown, -1, 1))
-    s = np.concatenate([np.linspace(0, 0.9, 31), [0.93, 0.955, 0.975, 0.99, 1.0]])
+    s = np.concatenate([np.linspace(0, 0.88, 27), [0.91, 0.935, 0.955, 0.972, 0.986, 0.995, 1.0]])
     turn = s[:, None] * full
-    side = arm - (arm @ crown)[:, None] * crown
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    rays = np.cos(turn)[..., None] * crown + np.sin(turn)[..., None] * side
+    across = arm - (arm @ crown)[:, None] * crown
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    rays = np.cos(turn)[..., None] * crown + np.sin(turn)[..., None] * across
     skull = cast(np.broadcast_to(centre, rays.shape).reshape(-1, 3), rays.reshape(-1, 3)).reshape(rays.shape)
-    locks = strands(turn, angle[None])
-    thick = curve(theta, list(THICKNESS), soft=6.0)
-    thick = 13 + (thick - 13) * smoothstep(0.1, 0.75, s)[:, None]
-    rise = np.sqrt(np.maximum(1 - s**7, 0))[:, None] * thick * (0.88 + 0.24 * locks) - 2.0 * s[:, None] ** 12
+    locks = strands(turn, side * angle)
+    thick = curve(side * theta, list(THICKNESS), soft=7.0)
+    thick = 12 + (thick - 12) * smoothstep(0.1, 0.75, s)[:, None]
+    profile = (np.maximum(1 - s**8, 0) ** 0.6)[:, None]
+    rise = profile * (thick * (0.95 + 0.1 * locks) + 3.4 * (locks - 0.5)) - 2.0 * s[:, None] ** 12
     points = skull + rise[..., None] * rays
     points[:, [0, -1], 0] = 0
-    share = np.broadcast_to(s[:, None], turn.shape)
-    fan = angle / np.pi  # the fan of the half: from straight down (front) to the right (back)
-    uv = np.stack([0.5 + 0.5 * share * np.sin(fan * np.pi / 2) ** 0.9, 1 - share * np.cos(fan * np.pi / 2) ** 0.9], -1)
-    return grid_part("hair", points, uv, pole=True, lock=locks, share=share)
+    share = np.broadcast_to(s[:, None], turn.shape).copy()
+    fan = 0.5 * angle  # of the half: from straight down (front) to the right (back)
+    uv = np.stack([0.5 + 0.5 * share * np.sin(fan) ** 0.9, 1 - share * np.cos(fan) ** 0.9], -1)
+    return points, uv, {"lock": locks, "share": share}
 
 
 def strands(turn: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """[R, C] in [0, 1]: locks that run from the hairline back over the crown."""
-    flow = 9 * angle + 1.2 * np.sin(2.2 * turn + 2 * angle)
-    fine = 0.5 + 0.5 * np.sin(31 * angle + 2.5 * turn + 1.5 * np.sin(3 * turn))
-    broad = 0.5 + 0.5 * np.cos(flow)
-    fade = smoothstep(0.05, 0.5, turn)
-    return (0.7 * broad + 0.3 * fine) * fade + 0.5 * (1 - fade)
+    """[R, C] in [0, 1]: locks that lean to the person's right, sharp in their partings and round on their backs."""
+    lean = angle[None] + 0.55 * turn * np.cos(0.5 * angle)[None] ** 2
+    broad = np.abs(np.sin(8.5 * lean + 0.9 * np.sin(3 * turn + 2 * lean)))
+    fine = np.abs(np.sin(19 * lean + 1.3 * np.sin(4 * turn - 1.5 * lean) + 0.8))
+    return (0.68 * broad**0.7 + 0.32 * fine**0.8) * smoothstep(0.02, 0.35, turn) + 0.6 * smoothstep(0.35, 0.02, turn)
 
 
 def build_shirt() -> Part:
@@ -171,10 +196,10 @@ def build_shirt() -> Part:
     theta = np.radians(np.linspace(0, 180, 41))
     # rows: half width, half depth, height in front / at the side / behind, mm
     rings = np.array([
-        [55, 54, -160, -146, -136], [58, 57, -159, -144, -134], [60.5, 59, -160, -144, -134], [62, 60.5, -163, -147, -137],
-        [63, 62, -168, -151, -141], [66, 64, -172, -154, -144], [80, 70, -180, -160, -152], [104, 78, -191, -168, -163],
-        [132, 86, -205, -177, -175], [158, 93, -222, -188, -190], [179, 100, -240, -202, -207], [194, 106, -260, -222, -227],
-        [202, 110, -282, -246, -250], [205, 113, -305, -274, -276], [205, 115, -328, -304, -304], [203, 116, -345, -335, -335],
+        [52, 52, -154, -138, -126], [55, 55, -153, -136, -124], [57.5, 57, -154, -136, -124], [59, 58.5, -157, -139, -127],
+        [60, 60, -162, -143, -131], [63, 62, -166, -146, -134], [78, 68, -174, -152, -141], [102, 76, -185, -159, -151],
+        [130, 84, -199, -167, -162], [156, 92, -215, -176, -176], [177, 99, -233, -189, -193], [192, 105, -253, -209, -213],
+        [200, 109, -276, -234, -236], [203, 112, -300, -262, -264], [203, 114, -324, -294, -294], [201, 115, -345, -330, -330],
     ])
     wide, deep, front, side, back = rings.T[..., None]
     bend = np.cos(theta)

@@ -38,13 +38,17 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Half of a part: points [N, 3] mm with x >= 0 on or off the midline, its grids, and values per point."""
+    """Half of a part: points [N, 3] mm with x >= 0 on or off the midline, its grids, and values per point.
+
+    `other`: the right half where it is not the left one's mirror image, also with x >= 0 and of the same grids.
+    """
 
     name: str
     points: np.ndarray
     grids: tuple[Grid, ...]
     colors: np.ndarray
     marks: dict[str, np.ndarray] = field(default_factory=dict)
+    other: Part | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +75,8 @@ PlaceUv = Callable[["Part", np.ndarray], np.ndarray]
 
 def assemble(parts: list[Part], left_uv: PlaceUv, right_uv: PlaceUv) -> Mesh:
     """Joins the half parts and their mirror images; the two functions put a part's uv into the atlas."""
-    points = np.concatenate([p.points for p in parts])
+    right_halves = [p.other or p for p in parts]
+    points, right = (np.concatenate([p.points for p in half]) for half in (parts, right_halves))
     part = np.repeat(np.arange(len(parts)), [len(p.points) for p in parts])
     n = len(points)
     middle = np.abs(points[:, 0]) < MIDLINE
@@ -90,16 +95,18 @@ def assemble(parts: list[Part], left_uv: PlaceUv, right_uv: PlaceUv) -> Mesh:
             uv_start += 2 * len(uv)
         start += len(p.points)
     marks = {}
-    for name in {m for p in parts for m in p.marks}:
-        marks[name] = np.concatenate([p.marks.get(name, np.zeros(len(p.points))) for p in parts])
-        marks[name] = np.concatenate([marks[name], marks[name][~middle]])
-    colors = np.concatenate([p.colors for p in parts])
+    for name in sorted({m for p in parts for m in p.marks}):
+        left_half, right_half = (
+            np.concatenate([p.marks.get(name, np.zeros(len(p.points))) for p in half]) for half in (parts, right_halves)
+        )
+        marks[name] = np.concatenate([left_half, right_half[~middle]])
+    colors, right_colors = (np.concatenate([p.colors for p in half]) for half in (parts, right_halves))
     return Mesh(
-        points=np.concatenate([points, points[~middle] * [-1, 1, 1]]),
+        points=np.concatenate([points, right[~middle] * [-1, 1, 1]]),
         faces=np.concatenate(faces),
         uvs=np.concatenate(uvs),
         uv_faces=np.concatenate(uv_faces),
-        colors=np.concatenate([colors, colors[~middle]]),
+        colors=np.concatenate([colors, right_colors[~middle]]),
         names=tuple(p.name for p in parts),
         part=np.concatenate([part, part[~middle]]),
         partner=partner,

@@ -22,20 +22,21 @@ BACK = ((112, 0.0), (132, -30.0), (150, -56.0), (180, -62.0))
 KEYS = (
     ("hidden", 0, ((0, 101), (30, 99), (50, 86), (65, 66), (80, 54), (95, 52), (112, 40), (132, 0), (150, -25), (180, -32))),
     ("hair", 4, ((0, 78), (30, 76), (50, 62), (70, 45), (90, 38), (112, 26), (132, -8), (150, -36), (180, -42))),
-    ("brow", 10, ((0, 43), (25, 45), (38, 42), (55, 34), (75, 26), (90, 22), (112, 10), (132, -18), (150, -46), (180, -52))),
-    ("crease", 9, ((0, 31), (16, 30), (37, 29), (48, 25), (60, 20), (80, 14), (95, 8), (112, -2), (132, -28), (150, -54), (180, -60))),
+    ("brow_top", 7, ((0, 53), (25, 54), (38, 51), (55, 42), (75, 30), (90, 26), (112, 14), (132, -14), (150, -42), (180, -48))),
+    ("brow", 8, ((0, 42), (25, 43), (38, 40), (55, 33), (75, 26), (90, 22), (112, 10), (132, -18), (150, -46), (180, -52))),
+    ("crease", 8, ((0, 31), (16, 30), (37, 29), (48, 25), (60, 20), (80, 14), (95, 8), (112, -2), (132, -28), (150, -54), (180, -60))),
     ("upper_lid", 7, ((0, 18.5), (16, 18.2), (37, 20), (48, 17), (62, 12), (80, 6), (95, 0), (112, -10), (132, -35), (150, -60), (180, -66))),
     ("lower_lid", 1, ((0, 18.5), (16, 18.2), (37, 20), (48, 17), (62, 12), (80, 6), (95, 0), (112, -10), (132, -35), (150, -60), (180, -66))),
     ("under_lid", 6, ((0, 8), (16, 8), (25, 6.5), (37, 9), (50, 6), (65, 1), (80, -5), (95, -10), (112, -19), (132, -41), (150, -65), (180, -70))),
-    ("nose", 23, ((0, -31), (30, -31), (45, -33), (60, -36), (80, -38), (95, -39), (112, -42), (132, -56), (150, -74), (180, -78))),
+    ("nose", 22, ((0, -31), (30, -31), (45, -33), (60, -36), (80, -38), (95, -39), (112, -42), (132, -56), (150, -74), (180, -78))),
     ("upper_vermilion", 7, ((0, -46), (30, -47), (45, -48), (60, -49), (80, -49), (95, -50), (112, -52), (132, -63), (150, -79), (180, -83))),
-    ("upper_lip", 7, ((0, -53.5), (16.5, -54), (30, -55), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
-    ("lower_lip", 1, ((0, -53.5), (16.5, -54), (30, -55), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
+    ("upper_lip", 7, ((0, -53.7), (10, -53.4), (16.5, -52.4), (30, -54), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
+    ("lower_lip", 1, ((0, -53.7), (10, -53.4), (16.5, -52.4), (30, -54), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
     ("lower_vermilion", 7, ((0, -64), (30, -62.5), (45, -63), (60, -63), (80, -63), (95, -65), (112, -66), (132, -73), (150, -87), (180, -90))),
     ("chin", 12, ((0, -86), (40, -81), (60, -74), (80, -70), (95, -70), (120, -78), (150, -97), (180, -99))),
     ("jaw", 8, ((0, -102), (20, -100), (40, -91), (60, -81), (80, -74), (95, -74), (120, -84), (150, -107), (180, -110))),
-    ("throat", 10, ((0, -120), (40, -116), (60, -108), (95, -98), (120, -100), (150, -122), (180, -125))),
-    ("collar", 12, ((0, -195), (180, -195))),
+    ("throat", 9, ((0, -120), (40, -116), (60, -108), (95, -98), (120, -100), (150, -122), (180, -125))),
+    ("collar", 10, ((0, -195), (180, -195))),
 )
 EYE_OPEN = (6.6, -5.6)  # mm the lid rims bow up and down from the line between the corners
 LIP_ROWS, LID_ROWS = 4, 3
@@ -106,7 +107,37 @@ def skin_grid() -> tuple[np.ndarray, np.ndarray]:
     under = slice(jaw + 1, throat)
     points[under] = settle(points[under].reshape(-1, 3)).reshape(points[under].shape)
     points[:, [0, -1], 0] = 0
-    return points, theta
+    return relax(points, theta), theta
+
+
+def relax(points: np.ndarray, theta: np.ndarray, rounds: int = 3) -> np.ndarray:
+    """[R, C, 3] the grid evened out along the surface, away from the landmark lines of eyes and lips."""
+    row = np.arange(len(points))[:, None]
+    near_eye = smoothstep(row_of("brow_top"), row_of("crease"), row)
+    near_eye = near_eye * smoothstep(row_of("under_lid") + 6, row_of("under_lid"), row)
+    near_eye = near_eye * smoothstep(CORNER - 5, CORNER - 1, theta) * smoothstep(OUTER + 8, OUTER, theta)
+    near_lips = smoothstep(row_of("upper_vermilion") - 3, row_of("upper_vermilion"), row)
+    near_lips = near_lips * smoothstep(row_of("lower_vermilion") + 4, row_of("lower_vermilion"), row)
+    near_lips = near_lips * smoothstep(CORNER + 14, CORNER + 3, theta)
+    once = np.setdiff1d(row, [row_of("lower_lid"), row_of("lower_lip")])  # doubled rows count once
+    share = (0.6 * (1 - np.maximum(near_eye, near_lips)))[once, :, None]
+    share[[0, -1]] = 0
+    smooth = points[once]
+    for _ in range(rounds):
+        for _ in range(3):
+            wide = np.concatenate([smooth[:, 1:2] * [-1, 1, 1], smooth, smooth[:, -2:-1] * [-1, 1, 1]], 1)
+            mean = 0.25 * (wide[:, :-2] + wide[:, 2:])
+            mean[1:-1] += 0.25 * (smooth[:-2] + smooth[2:])
+            smooth = smooth + share * (mean - smooth)
+        smooth = settle(smooth.reshape(-1, 3), 1).reshape(smooth.shape)
+        smooth[:, [0, -1], 0] = 0
+    points = points.copy()
+    points[once] = smooth
+    for below, first, last in (("lower_lid", CORNER_COLUMN, OUTER_COLUMN), ("lower_lip", -1, CORNER_COLUMN)):
+        column = np.arange(len(theta))
+        closed = (column <= first) | (column >= last)
+        points[row_of(below), closed] = points[row_of(below) - 1, closed]
+    return points
 
 
 def lip_relief(points: np.ndarray, theta: np.ndarray) -> np.ndarray:
@@ -115,19 +146,22 @@ def lip_relief(points: np.ndarray, theta: np.ndarray) -> np.ndarray:
     rows = np.arange(len(points))[:, None]
     top, upper, lower, bottom = (row_of(k) for k in ("upper_vermilion", "upper_lip", "lower_lip", "lower_vermilion"))
     u = theta / CORNER
-    taper = np.maximum(1 - np.minimum(u, 1) ** 2.4, 0) ** 0.7
+    taper = np.maximum(1 - np.minimum(u, 1) ** 2.2, 0) ** 0.85
     t_up = np.clip((rows - top) / (upper - top), -2, 1)
     t_low = np.clip((bottom - rows) / (bottom - lower), -2, 1)
-    upper_lip = np.where(t_up >= 0, 1.4 + 3.4 * np.sin(np.pi * 0.62 * np.maximum(t_up, 0)) - 2.4 * np.maximum(t_up, 0) ** 4, 1.4 * smoothstep(-1.2, 0, t_up))
-    lower_lip = np.where(t_low >= 0, 0.6 + 5.2 * np.sin(np.pi * 0.66 * np.maximum(t_low, 0)) - 2.4 * np.maximum(t_low, 0) ** 4, 0.6 * smoothstep(-0.8, 0, t_low))
+    upper_lip = np.where(t_up >= 0, 1.2 + 4.0 * np.sin(np.pi * 0.62 * np.maximum(t_up, 0)) - 2.9 * np.maximum(t_up, 0) ** 4, 1.2 * smoothstep(-1.3, 0, t_up))
+    lower_lip = np.where(t_low >= 0, 0.5 + 5.9 * np.sin(np.pi * 0.66 * np.maximum(t_low, 0)) - 3.5 * np.maximum(t_low, 0) ** 4, 0.5 * smoothstep(-0.8, 0, t_low))
     push = taper * np.where(rows <= upper, upper_lip, lower_lip)
     y, line = points[..., 1], points[upper, :, 1]
-    corner = np.exp(-(((theta - CORNER) / 2.6) ** 2) - ((y - line) / 4.5) ** 2)
-    push = push - 2.6 * corner
+    corner = np.exp(-(((theta - CORNER) / 3.0) ** 2) - ((y - line) / 5.0) ** 2)
+    push = push - 2.0 * corner
     nose = points[row_of("nose"), 0, 1]
     between = smoothstep(nose + 2, nose - 5, y) * smoothstep(points[top, 0, 1] - 3, points[top, 0, 1] + 2, y)
     x = points[..., 0]
-    push = push + between * (0.9 * np.exp(-(((x - 5.0) / 2.3) ** 2)) - 1.0 * np.exp(-((x / 3.0) ** 2)))
+    push = push + between * (0.55 * np.exp(-(((x - 5.4) / 2.8) ** 2)) - 0.8 * np.exp(-((x / 3.4) ** 2)))
+    fold = rows - row_of("upper_lid") + 0.0 * theta  # the crease over the upper lid
+    over_eye = smoothstep(CORNER, CORNER + 5, theta) * smoothstep(OUTER + 4, OUTER - 4, theta)
+    push = push + over_eye * (0.9 * np.exp(-(((fold + 9.5) / 2.0) ** 2)) - 1.3 * np.exp(-(((fold + 6.8) / 1.1) ** 2)))
     angle = np.radians(0.6 * theta)
     points += push[..., None] * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
     points[:, 0, 0] = 0
@@ -157,7 +191,7 @@ def inside_lips(rim: np.ndarray, sign: float) -> np.ndarray:
     u = np.linspace(0, 1, len(rim))
     taper = np.maximum(1 - u**3, 0) ** 0.6
     back = np.array([2.0, 4.5, 6.5, 7.5])[:, None] * (0.55 + 0.45 * taper)
-    lift = np.array([0.1, 1.0, 4.0, 9.0])[:, None] * taper
+    lift = np.array([-0.35, 0.5, 4.0, 9.0])[:, None] * taper  # first past each other, so that closed lips show no slit
     rows = np.repeat(rim[None], LIP_ROWS, 0)
     rows[..., 2] -= back
     rows[..., 1] += sign * lift
@@ -181,7 +215,7 @@ def pouch(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
 
 
 # Heights in the UV atlas of the bands between landmark lines, and of the openings, in parts of the island.
-BANDS = (0, 3, 8, 5, 5, 0, 4, 11, 4.5, 5, 0, 5, 7, 5, 6, 7)
+BANDS = (0, 3, 5, 5, 4, 5, 0, 4, 11, 4.5, 5, 0, 5, 7, 5, 6, 7)
 EYE_HOLE, MOUTH_HOLE = 8.0, 8.5
 
 
