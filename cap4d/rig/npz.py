@@ -5,12 +5,12 @@ one-line DataErrors.
 from __future__ import annotations
 
 import math
-import os
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from cap4d.atomic import replacing
 from cap4d.errors import DataError
 
 MAX_MEMBER_BYTES = 1 << 31  # the largest array of any head model is some hundred megabytes
@@ -54,14 +54,8 @@ def read_npy(path: Path) -> np.ndarray:
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Writes an .npz through a temporary file, so that `path` is either whole or untouched."""
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as stream:
-            np.savez(stream, **arrays)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, **arrays)
 
 
 def checked(
