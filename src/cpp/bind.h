@@ -17,4 +17,12 @@ struct BoundGaussians {
 // A triangle without area gets some rotation and its own (possibly zero) size; nothing becomes NaN that was not.
 void bind(const float* vertices, const BoundGaussians& bound, int threads, float* means, float* quats, float* scales);
 
+// The VJP of `bind`: from gradients of its outputs to those of vertices [G, 3], means, quats and log_scales, all overwritten.
+// A triangle without area passes on what moves its centre and nothing else.
+struct BindGradients {
+  const float *v_means, *v_quats, *v_scales;                    // in
+  float *v_vertices, *v_local_means, *v_local_quats, *v_log_scales;  // out
+};
+void bind_vjp(const float* vertices, std::size_t vertices_count, const BoundGaussians& bound, int threads, const BindGradients& gradients);
+
 }  // namespace cap4d

@@ -1,6 +1,7 @@
 #include <pybind11/numpy.h>
 #include <pybind11/stl.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <optional>
@@ -21,21 +22,17 @@ using FloatArray = py::array_t<float, py::array::c_style>;
 using DoubleArray = py::array_t<double, py::array::c_style>;
 using Background = std::optional<std::array<float, 3>>;
 
-std::string describe(const py::array& a) {
+std::string shape_text(const py::ssize_t* sizes, std::size_t count) {
   std::string text = "[";
-  for (py::ssize_t i = 0; i < a.ndim(); ++i) text += (i ? ", " : "") + std::to_string(a.shape(i));
+  for (std::size_t i = 0; i < count; ++i) text.append(i ? ", " : "").append(std::to_string(sizes[i]));
   return text + "]";
 }
 
+std::string describe(const py::array& a) { return shape_text(a.shape(), a.ndim()); }
+
 void expect(const py::array& a, const char* name, std::initializer_list<py::ssize_t> shape) {
-  bool same = a.ndim() == static_cast<py::ssize_t>(shape.size());
-  py::ssize_t i = 0;
-  std::string wanted = "[";
-  for (const py::ssize_t size : shape) {
-    same = same && a.shape(i) == size;
-    wanted += (i++ ? ", " : "") + std::to_string(size);
-  }
-  if (!same) throw std::invalid_argument(std::string(name) + ": expected " + wanted + "], got " + describe(a));
+  if (a.ndim() != static_cast<py::ssize_t>(shape.size()) || !std::equal(shape.begin(), shape.end(), a.shape()))
+    throw std::invalid_argument(std::string(name) + ": expected " + shape_text(shape.begin(), shape.size()) + ", got " + describe(a));
 }
 
 struct Inputs {
@@ -107,11 +104,10 @@ py::tuple rasterize(FloatArray means, FloatArray quats, FloatArray scales, Float
   {
     py::gil_scoped_release release;
     *rendered = render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kTrain, threads, out);
-    std::fill_n(xy, 2 * n, 0.0f);
     std::copy_n(rendered->radii.get(), n, radius);
-    for (std::size_t i = 0; i < rendered->drawn; ++i) {
-      const Splat& s = rendered->splats[i];
-      xy[2 * std::size_t{s.id}] = s.x, xy[2 * std::size_t{s.id} + 1] = s.y;
+    for (py::ssize_t i = 0; i < n; ++i) {
+      const bool drawn = radius[i] > 0;
+      xy[2 * i] = drawn ? rendered->splats[i].x : 0.0f, xy[2 * i + 1] = drawn ? rendered->splats[i].y : 0.0f;
     }
   }
   return py::make_tuple(image.rgb, image.alpha, image.depth, means2d, radii, py::cast(std::move(rendered)));
@@ -147,7 +143,7 @@ py::tuple rasterize_vjp(const Rendered& rendered, FloatArray means, FloatArray q
 void register_render(py::module_& m) {
   py::class_<Rendered>(m, "Rendered", "What the forward pass leaves for the gradient.")
       .def_property_readonly("drawn", [](const Rendered& r) { return r.drawn; })
-      .def_property_readonly("pairs", [](const Rendered& r) { return r.tiling.count; });
+      .def_property_readonly("pairs", [](const Rendered& r) { return r.pairs.count; });
   const auto means = py::arg("means").noconvert();
   const auto quats = py::arg("quats").noconvert();
   const auto scales = py::arg("scales").noconvert();

@@ -24,8 +24,9 @@ inline constexpr float kSafeNorm2 = 1e-20f;
 // How far out, in standard deviations, the radius that densification prunes by reaches (3DGS).
 inline constexpr float kRadiusSigmas = 3.0f;
 
-inline constexpr int kTile = 16;      // px a side; the unit of work of a thread and of binning
-inline constexpr int kMaxSide = 16384;  // px; larger images are refused
+inline constexpr int kTileLog2 = 4;
+inline constexpr int kTile = 1 << kTileLog2;  // px a side; the unit of work of a thread and of binning
+inline constexpr int kMaxSide = 16384;       // px; larger images are refused
 
 inline constexpr double kPi = 3.14159265358979323846;
 inline constexpr float kLog2e = 1.44269504088896341f;

@@ -24,7 +24,7 @@ struct GaussianGrads {  // caller-owned outputs, shaped like the inputs; every e
 
 // The image of one Gaussian: all that a pixel reads, one cache line.
 // alpha(dx, dy) = exp2(log2_opacity + a dx^2 + b dx dy + c dy^2), dx, dy = pixel centre - (x, y) in px.
-// Where alpha >= 1/255 is an ellipse; the last five fields are its outline (see Outline in tiles.h).
+// Where alpha >= 1/255 is an ellipse; the last five fields are its outline (see outline_span in tiles.cpp).
 struct alignas(64) Splat {
   float x, y;                   // px
   float a, b, c, log2_opacity;  // exponent in base 2: a, c < 0
@@ -34,9 +34,14 @@ struct alignas(64) Splat {
   float y_rightmost;   // dy at which x is largest
   float half_width2;   // px^2, of the chord at dy = 0
   float inv_height2;   // 1 / half_height^2
-  std::uint32_t id;    // which of the caller's Gaussians
+  float unused;
 };
 static_assert(sizeof(Splat) == 64);
+
+// The tiles that a splat's bounding box meets, inclusive; empty when x1 < x0 or y1 < y0.
+struct TileBox {
+  std::int16_t x0, x1, y0, y1;
+};
 
 // Sums over the pixels of one tile (or of the image) of what one Gaussian receives.
 // s = dL/d(ln alpha) at a pixel; its moments about the mean give the gradients of position, conic and opacity.

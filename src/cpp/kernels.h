@@ -28,22 +28,23 @@ struct TileJob {
   const float* background;  // [3]
 };
 
-// Where a Gaussian's per-tile gradients are: isect_grads[slots[k]] for k in [offsets[rank], offsets[rank + 1]).
-struct GradSlots {
-  const SplatGrad* isect_grads;
-  const std::uint32_t* slots;
-  const std::uint32_t* offsets;
-  const std::uint32_t* ranks;  // [N] place in depth order of each of the caller's Gaussians; read only where radii > 0
+// What Gaussian i received in each of its tiles: grads[offsets[i]] up to grads[offsets[i + 1]].
+struct PairGrads {
+  const SplatGrad* grads;
+  const std::uint32_t* offsets;  // [N + 1]
 };
 
 struct Kernels {
   const char* isa;
-  // Fills splats and radii (3 standard deviations, px; 0 = not drawn) for Gaussians [begin, end); a splat only where drawn.
-  void (*project_fwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii);
-  void (*project_bwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, const std::int32_t* radii, const GradSlots&,
+  // Fills splats and radii (3 standard deviations, px; 0 = not drawn) of Gaussians [begin, end), a splat only where drawn,
+  // and their boxes [end - begin].
+  void (*project_fwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii,
+                      TileBox* boxes);
+  void (*project_bwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, const std::int32_t* radii, const PairGrads&,
                       const GaussianGrads&);
   void (*rasterize_fwd)(const TileJob&, const Image&);
-  void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, SplatGrad* isect_grads);
+  // Writes grads[slots[i]] for each i of the job.
+  void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t* slots, SplatGrad* grads);
 };
 
 // The widest variant this processor runs; CAP4D_ISA=base|v3|v4 in the environment asks for a narrower one.

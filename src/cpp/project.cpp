@@ -10,7 +10,7 @@ namespace cap4d::CAP4D_ISA {
 
 extern const Kernels kKernels;
 void rasterize_fwd(const TileJob&, const Image&);
-void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, SplatGrad*);
+void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t*, SplatGrad*);
 
 namespace {
 
@@ -70,7 +70,18 @@ int radius_of(float xx, float xy, float yy) {
   return static_cast<int>(std::min(std::ceil(kRadiusSigmas * std::sqrt(longest)), 1e9f));
 }
 
-void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii) {
+// First and last tile of the pixel centres in [low, high] px, a hair too many rather than one too few.
+struct TileRange {
+  IntV first, last;
+};
+CAP4D_INLINE TileRange tile_range(FloatV low, FloatV high, int pixels) {
+  const FloatV zero = splat(0.0f), end = splat(static_cast<float>(pixels));
+  const FloatV first = min(max(low + 0.499f, zero), end), last = min(max(high + 0.501f, zero), end);
+  return {__builtin_convertvector(first, IntV) >> kTileLog2, (__builtin_convertvector(last, IntV) - 1) >> kTileLog2};
+}
+
+void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii,
+                 TileBox* boxes) {
   const int used = (g.sh_degree + 1) * (g.sh_degree + 1);
   for (std::size_t first = begin; first < end; first += kLanes) {
     const int count = static_cast<int>(std::min<std::size_t>(kLanes, end - first));
@@ -102,6 +113,7 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
                                height, slope, f.xy / f.xx * width, f.det / f.yy * reach, 1.0f / height2, f.xx, f.xy, f.yy};
     float fields[15][kLanes];
     spread<15>(fields_v, fields);
+    const TileRange columns = tile_range(f.x - width, f.x + width, camera.width), rows = tile_range(f.y - height, f.y + height, camera.height);
     for (; todo; todo &= todo - 1) {
       const int l = __builtin_ctz(todo);
       const std::size_t id = first + l;
@@ -112,18 +124,18 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
       s.red = std::max(color[0], 0.0f), s.green = std::max(color[1], 0.0f), s.blue = std::max(color[2], 0.0f);
       s.depth = fields[6][l], s.half_height = fields[7][l], s.slope = fields[8][l], s.y_rightmost = fields[9][l];
       s.half_width2 = fields[10][l], s.inv_height2 = fields[11][l];
-      s.id = static_cast<std::uint32_t>(id);
       radii[id] = radius_of(fields[12][l], fields[13][l], fields[14][l]);
+      boxes[id - begin] = {static_cast<std::int16_t>(columns.first[l]), static_cast<std::int16_t>(columns.last[l]),
+                           static_cast<std::int16_t>(rows.first[l]), static_cast<std::int16_t>(rows.last[l])};
     }
   }
 }
 
 // Sum of a Gaussian's per-tile gradients, in the order its tiles were listed.
-CAP4D_INLINE SplatGrad reduce_slots(const GradSlots& slots, std::size_t id) {
-  const std::uint32_t rank = slots.ranks[id];
+CAP4D_INLINE SplatGrad total(const PairGrads& pairs, std::size_t id) {
   SplatGrad sum{};
-  for (std::uint32_t k = slots.offsets[rank]; k < slots.offsets[rank + 1]; ++k) {
-    const SplatGrad& v = slots.isect_grads[slots.slots[k]];
+  for (std::uint32_t k = pairs.offsets[id]; k < pairs.offsets[id + 1]; ++k) {
+    const SplatGrad& v = pairs.grads[k];
     sum.red += v.red, sum.green += v.green, sum.blue += v.blue, sum.depth += v.depth;
     sum.s += v.s, sum.sx += v.sx, sum.sy += v.sy, sum.sxx += v.sxx, sum.sxy += v.sxy, sum.syy += v.syy;
   }
@@ -154,14 +166,14 @@ CAP4D_INLINE void put(float* items, std::size_t id, const float values[kComponen
 }
 
 void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin, std::size_t end, const std::int32_t* radii,
-                 const GradSlots& slots, const GaussianGrads& out) {
+                 const PairGrads& pairs, const GaussianGrads& out) {
   const int used = (g.sh_degree + 1) * (g.sh_degree + 1);
   for (std::size_t first = begin; first < end; first += kLanes) {
     const int count = static_cast<int>(std::min<std::size_t>(kLanes, end - first));
     float received[10][kLanes] = {};
     for (int l = 0; l < count; ++l) {
       if (radii[first + l] == 0) continue;
-      const SplatGrad v = reduce_slots(slots, first + l);
+      const SplatGrad v = total(pairs, first + l);
       const float values[10] = {v.red, v.green, v.blue, v.depth, v.s, v.sx, v.sy, v.sxx, v.sxy, v.syy};
       for (int c = 0; c < 10; ++c) received[c][l] = values[c];
     }

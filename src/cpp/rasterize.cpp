@@ -10,11 +10,11 @@
 #include "constants.h"
 #include "kernels.h"
 #include "simd.h"
-#include "tiles.h"
 
 namespace cap4d::CAP4D_ISA {
 namespace {
 
+// Blocks are numbered down the columns, so that one register holds the bands of a column (or of several).
 constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlockColumns = kTile / kBlockWidth, kBands = kTile / kBlockHeight, kBlocks = kBlockColumns * kBands;
 static_assert(kBlocks <= 64);
@@ -31,11 +31,14 @@ constexpr Lanes kPixel = [] {
   return lanes;
 }();
 
+CAP4D_INLINE int block_x(int block) { return block / kBands * kBlockWidth; }
+CAP4D_INLINE int block_y(int block) { return block % kBands * kBlockHeight; }
+
 struct Pixel {
   int x, y;
 };
 CAP4D_INLINE Pixel pixel_of(const TileJob& job, int block, int lane) {
-  return {job.x0 + block % kBlockColumns * kBlockWidth + lane % kBlockWidth, job.y0 + block / kBlockColumns * kBlockHeight + lane / kBlockWidth};
+  return {job.x0 + block_x(block) + lane % kBlockWidth, job.y0 + block_y(block) + lane / kBlockWidth};
 }
 
 CAP4D_INLINE bool inside(const TileJob& job, Pixel p) { return p.x < job.camera->width && p.y < job.camera->height; }
@@ -52,22 +55,35 @@ BlockSet open_pixels(const TileJob& job, FloatV* transmittance) {
   return open;
 }
 
-// Blocks that the outline of `s` meets: exact for the pixel centres, band by band.
+struct Bands {  // first pixel centre of the band and of the column of block l, relative to the tile
+  float y[kLanes], x[kLanes];
+};
+constexpr Bands kBand = [] {
+  Bands bands{};
+  for (int l = 0; l < kLanes; ++l) bands.y[l] = l % kBands * kBlockHeight + 0.5f, bands.x[l] = l / kBands * kBlockWidth + 0.5f;
+  return bands;
+}();
+
+// Blocks that the outline of `s` meets, exact for their pixel centres' rows and columns: the widest chord of an ellipse within a
+// band is at its extreme point, or at the row of the band nearest to that.
 CAP4D_INLINE BlockSet touched_blocks(const Splat& s, int x0, int y0) {
+  constexpr int kColumnsAtOnce = kLanes > kBands ? kLanes / kBands : 1, kGroups = kBands > kLanes ? kBands / kLanes : 1;
   BlockSet touched = 0;
-  const float x = s.x - x0 - 0.5f, y = s.y - y0;
-  for (int band = 0; band < kBands; ++band) {
-    const float low = std::max(band * kBlockHeight + 0.5f - y, -s.half_height);
-    const float high = std::min(band * kBlockHeight + (kBlockHeight - 0.5f) - y, s.half_height);
-    if (!(low <= high)) continue;
-    const float right = std::min(std::max(s.y_rightmost, low), high), left = std::min(std::max(-s.y_rightmost, low), high);
-    const float half_left = std::sqrt(s.half_width2 * std::max(0.0f, 1.0f - left * left * s.inv_height2));
-    const float half_right = std::sqrt(s.half_width2 * std::max(0.0f, 1.0f - right * right * s.inv_height2));
-    const int first = static_cast<int>(std::min(std::max(x + s.slope * left - half_left, 0.0f), kTile - 0.5f) + 0.999f);
-    const int last = static_cast<int>(std::min(std::max(x + s.slope * right + half_right, -1.0f), kTile - 1.0f) + 1.0f) - 1;
-    if (last < first) continue;
-    const unsigned row = ((2u << (last / kBlockWidth)) - 1) & ~((1u << (first / kBlockWidth)) - 1);
-    touched |= static_cast<BlockSet>(row & ((1u << kBlockColumns) - 1)) << (band * kBlockColumns);
+  const FloatV height = splat(s.half_height), rightmost = splat(s.y_rightmost), zero = splat(0.0f);
+  const float x = s.x - x0, y = s.y - y0;
+  for (int group = 0; group < kGroups; ++group) {
+    const FloatV first_row = load(kBand.y) + (group * kLanes * kBlockHeight - y);
+    const FloatV low = max(first_row, -height), high = min(first_row + (kBlockHeight - 1.0f), height);
+    const MaskV crossed = less_equal(low, high);
+    const FloatV right = min(max(rightmost, low), high), left = min(max(-rightmost, low), high);
+    const FloatV half_right = sqrt(s.half_width2 * max(1.0f - right * right * s.inv_height2, zero));
+    const FloatV half_left = sqrt(s.half_width2 * max(1.0f - left * left * s.inv_height2, zero));
+    const FloatV first = s.slope * left - half_left + x, last = s.slope * right + half_right + x;
+    for (int column = 0; column < kBlockColumns; column += kColumnsAtOnce) {
+      const FloatV centre = load(kBand.x) + column * static_cast<float>(kBlockWidth);
+      const MaskV met = both(crossed, both(less_equal(first, centre + (kBlockWidth - 1.0f)), less_equal(centre, last)));
+      touched |= static_cast<BlockSet>(bits(met)) << (column * kBands + group * kLanes);
+    }
   }
   return touched;
 }
@@ -79,8 +95,8 @@ struct Contribution {  // of one Gaussian to the pixels of one block
 
 // False where nothing of the block is visible. `visible`: alpha >= 1/255 and the pixel open; `stop`: this one would finish it.
 CAP4D_INLINE bool contribute(const Splat& s, const TileJob& job, int block, FloatV transmittance, Contribution& c) {
-  c.dx = load(kPixel.x) + (job.x0 + block % kBlockColumns * kBlockWidth - s.x);
-  c.dy = load(kPixel.y) + (job.y0 + block / kBlockColumns * kBlockHeight - s.y);
+  c.dx = load(kPixel.x) + (job.x0 + block_x(block) - s.x);
+  c.dy = load(kPixel.y) + (job.y0 + block_y(block) - s.y);
   const FloatV exponent = c.dx * (s.a * c.dx + s.b * c.dy) + (s.c * c.dy * c.dy + s.log2_opacity);
   c.visible = both(less_equal(splat(kLog2AlphaMin), exponent), less(splat(0.0f), transmittance));
   if (!any(c.visible)) return false;
@@ -94,6 +110,13 @@ CAP4D_INLINE bool contribute(const Splat& s, const TileJob& job, int block, Floa
   return true;
 }
 
+// Splats lie in memory in the caller's order: ask for them before they are needed.
+constexpr std::size_t kPrefetch = 12;
+CAP4D_INLINE const Splat& splat_at(const TileJob& job, std::size_t i) {
+  if (i + kPrefetch < job.count) __builtin_prefetch(&job.splats[job.isects[i + kPrefetch]]);
+  return job.splats[job.isects[i]];
+}
+
 CAP4D_INLINE bool finished(FloatV transmittance) { return !any(less(splat(0.0f), transmittance)); }
 
 }  // namespace
@@ -102,7 +125,7 @@ void rasterize_fwd(const TileJob& job, const Image& image) {
   FloatV transmittance[kBlocks], red[kBlocks] = {}, green[kBlocks] = {}, blue[kBlocks] = {}, depth[kBlocks] = {};
   BlockSet open = open_pixels(job, transmittance);
   for (std::size_t i = 0; i < job.count && open; ++i) {
-    const Splat& s = job.splats[job.isects[i]];
+    const Splat& s = splat_at(job, i);
     for (BlockSet todo = open & touched_blocks(s, job.x0, job.y0); todo; todo &= todo - 1) {
       const int block = __builtin_ctzll(todo);
       Contribution c;
@@ -165,11 +188,11 @@ void load_pixel_grads(const TileJob& job, const Image& image, const ImageGrad& v
 }
 
 template <bool kDepth>
-void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, SplatGrad* isect_grads) {
+void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32_t* slots, SplatGrad* pair_grads) {
   FloatV transmittance[kBlocks];
   BlockSet open = open_pixels(job, transmittance);
   for (std::size_t i = 0; i < job.count; ++i) {
-    const Splat& s = job.splats[job.isects[i]];
+    const Splat& s = splat_at(job, i);
     BlockSet todo = open ? open & touched_blocks(s, job.x0, job.y0) : 0;
     FloatV v_red{}, v_green{}, v_blue{}, v_depth{}, v_s{}, v_sx{}, v_sy{}, v_sxx{}, v_sxy{}, v_syy{};
     bool touched = false;
@@ -199,7 +222,7 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, SplatGrad* isect_
       transmittance[block] = c.next;
       if (any(c.stop) && finished(c.next)) open &= ~(BlockSet{1} << block);
     }
-    SplatGrad& out = isect_grads[i];
+    SplatGrad& out = pair_grads[slots[i]];
     if (!touched) {
       out = SplatGrad{};
       continue;
@@ -214,13 +237,13 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, SplatGrad* isect_
 
 }  // namespace
 
-void rasterize_bwd(const TileJob& job, const Image& image, const ImageGrad& v, SplatGrad* isect_grads) {
+void rasterize_bwd(const TileJob& job, const Image& image, const ImageGrad& v, const std::uint32_t* slots, SplatGrad* pair_grads) {
   PixelGrads grads;
   load_pixel_grads(job, image, v, grads);
   if (v.depth)
-    rasterize_tile_bwd<true>(job, grads, isect_grads);
+    rasterize_tile_bwd<true>(job, grads, slots, pair_grads);
   else
-    rasterize_tile_bwd<false>(job, grads, isect_grads);
+    rasterize_tile_bwd<false>(job, grads, slots, pair_grads);
 }
 
 }  // namespace cap4d::CAP4D_ISA

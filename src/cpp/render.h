@@ -1,4 +1,4 @@
-// The whole splatting pipeline: project, sort by depth, tile, rasterise; and its gradient.
+// The whole splatting pipeline: project, sort by depth, list per tile, rasterise; and its gradient.
 #pragma once
 #include "camera.h"
 #include "gaussians.h"
@@ -12,14 +12,15 @@ struct Rendered {
   Camera camera;
   std::size_t count = 0, drawn = 0;
   float background[3] = {0, 0, 0};
-  Buffer<std::int32_t> radii;    // [N] 3 standard deviations, px; 0 = not drawn
-  Buffer<Splat> splats;          // [drawn] near to far
-  Buffer<std::uint32_t> ranks;   // [N] where each Gaussian is in splats, if drawn
-  Tiling tiling;
+  Buffer<std::int32_t> radii;  // [N] 3 standard deviations, px; 0 = not drawn
+  Buffer<Splat> splats;        // [N] where drawn
+  Pairs pairs;
+  TileLists lists;
 };
 
 enum class Pass { kPlay, kTrain };  // kTrain keeps what the gradient needs
 
+// Raises std::length_error beyond 2^31 tile-Gaussian pairs.
 Rendered render_fwd(const Camera& camera, const GaussiansView& gaussians, const float* background, Pass pass, int threads, const Image& image);
 
 // `image` is the forward pass's output, `gaussians` its input. The same bits for any number of threads.

@@ -1,6 +1,5 @@
 #include "tiles.h"
 
-#include <stdexcept>
 #include <utility>
 
 #include "parallel.h"
@@ -8,92 +7,71 @@
 namespace cap4d {
 namespace {
 
-// Chunks of ranks are binned independently; a tile's list is the chunks' lists one after the other, so their number is free.
+// Ranks are binned in chunks; a tile's list is the chunks' lists one after the other, so their number never shows.
 constexpr std::size_t kChunks = 16;
-constexpr std::uint64_t kMaxPairs = 1ull << 31;
 
-struct Chunk {
-  std::vector<std::uint32_t> tiles;    // of the chunk's pairs, rank after rank
-  std::vector<std::uint32_t> counts;   // per tile; later the place of the chunk's next pair in it
-  std::vector<std::uint32_t> per_rank;
-  std::uint32_t first_pair = 0;
+struct Span {  // inclusive
+  int first, last;
 };
 
-int floor_div_tile(float pixel, int limit) {
-  return std::clamp(static_cast<int>(std::floor(std::clamp(pixel, -1.0f, static_cast<float>(kMaxSide)) / kTile)), 0, limit);
-}
-
-void list_tiles(const Splat* splats, std::size_t begin, std::size_t end, const Camera& camera, const Tiling& tiling, Chunk& chunk) {
-  chunk.counts.assign(static_cast<std::size_t>(tiling.columns) * tiling.rows, 0);
-  chunk.per_rank.reserve(end - begin);
-  chunk.tiles.reserve(2 * (end - begin));
-  for (std::size_t r = begin; r < end; ++r) {
-    const Splat& s = splats[r];
-    const std::size_t before = chunk.tiles.size();
-    const int row0 = floor_div_tile(s.y - s.half_height - 0.5f, tiling.rows - 1), row1 = floor_div_tile(s.y + s.half_height, tiling.rows - 1);
-    for (int row = row0; row <= row1; ++row) {
-      const Span span = outline_span(s, row * kTile, std::min((row + 1) * kTile, camera.height) - 1, camera.width);
-      if (span.last < span.first) continue;
-      for (int column = span.first / kTile; column <= span.last / kTile; ++column) {
-        const std::uint32_t tile = row * tiling.columns + column;
-        chunk.tiles.push_back(tile);
-        ++chunk.counts[tile];
-      }
-    }
-    if (chunk.tiles.size() > kMaxPairs) throw std::length_error("render: more than 2^31 tile-Gaussian pairs");
-    chunk.per_rank.push_back(static_cast<std::uint32_t>(chunk.tiles.size() - before));
-  }
+// Columns of pixel centres inside the outline for rows [row0, row1], clipped to [0, columns). The widest chord of an ellipse
+// within a band is at its extreme point, or at the row of the band nearest to that.
+Span outline_span(const Splat& s, int row0, int row1, int columns) {
+  const float low = std::max(row0 + 0.5f - s.y, -s.half_height), high = std::min(row1 + 0.5f - s.y, s.half_height);
+  if (!(low <= high)) return {0, -1};
+  const float right = std::min(std::max(s.y_rightmost, low), high), left = std::min(std::max(-s.y_rightmost, low), high);
+  const auto half = [&](float dy) { return std::sqrt(s.half_width2 * std::max(0.0f, 1.0f - dy * dy * s.inv_height2)); };
+  const float x0 = s.x + s.slope * left - half(left), x1 = s.x + s.slope * right + half(right), end = static_cast<float>(columns);
+  return {static_cast<int>(std::clamp(x0 + 0.499f, 0.0f, end)), static_cast<int>(std::clamp(x1 + 0.501f, 0.0f, end)) - 1};
 }
 
 }  // namespace
 
-Tiling tile_splats(const Splat* splats, std::size_t count, const Camera& camera, bool with_slots, int threads) {
-  Tiling tiling;
-  tiling.columns = (camera.width + kTile - 1) / kTile;
-  tiling.rows = (camera.height + kTile - 1) / kTile;
-  const std::size_t tiles = static_cast<std::size_t>(tiling.columns) * tiling.rows;
-  std::vector<Chunk> chunks(kChunks);
-  const std::size_t size = (count + kChunks - 1) / kChunks;
-  const auto bounds = [&](std::size_t i) { return std::pair(std::min(count, i * size), std::min(count, (i + 1) * size)); };
-  parallel_for(kChunks, 1, threads, [&](std::size_t first, std::size_t last) {
-    for (std::size_t i = first; i < last; ++i) list_tiles(splats, bounds(i).first, bounds(i).second, camera, tiling, chunks[i]);
-  });
-  std::uint64_t total = 0;
-  for (Chunk& chunk : chunks) {
-    chunk.first_pair = static_cast<std::uint32_t>(total);
-    total += chunk.tiles.size();
-    if (total > kMaxPairs) throw std::length_error("render: more than 2^31 tile-Gaussian pairs");
+void list_tiles(const Splat& splat, TileBox box, const Camera& camera, std::vector<std::uint32_t>& tiles) {
+  const std::uint32_t columns = grid_of(camera).columns;
+  const bool thin = box.x0 == box.x1 || box.y0 == box.y1;  // an ellipse meets every tile of a box one tile wide
+  for (int row = box.y0; row <= box.y1; ++row) {
+    int first = box.x0, last = box.x1;
+    if (!thin) {
+      const Span span = outline_span(splat, row * kTile, std::min((row + 1) * kTile, camera.height) - 1, camera.width);
+      if (span.last < span.first) continue;
+      first = span.first / kTile, last = span.last / kTile;
+    }
+    for (int column = first; column <= last; ++column) tiles.push_back(row * columns + column);
   }
-  tiling.count = static_cast<std::uint32_t>(total);
-  tiling.isects = make_buffer<std::uint32_t>(total);
-  tiling.tile_offsets.resize(tiles + 1);
+}
+
+TileLists make_tile_lists(const Pairs& pairs, const std::uint32_t* order, std::size_t drawn, Grid grid, bool with_slots, int threads) {
+  const std::size_t tiles = grid.count(), size = (drawn + kChunks - 1) / kChunks;
+  TileLists lists;
+  lists.isects = make_buffer<std::uint32_t>(pairs.count);
+  if (with_slots) lists.slots = make_buffer<std::uint32_t>(pairs.count);
+  lists.offsets.resize(tiles + 1);
+  std::vector<std::uint32_t> places(kChunks * tiles, 0);  // first counts, then where the chunk's next Gaussian of the tile goes
+  const auto each_pair = [&](std::size_t chunk, auto&& visit) {
+    std::uint32_t* place = places.data() + chunk * tiles;
+    for (std::size_t rank = std::min(drawn, chunk * size); rank < std::min(drawn, (chunk + 1) * size); ++rank) {
+      const std::uint32_t id = order[rank];
+      for (std::uint32_t pair = pairs.offsets[id]; pair < pairs.offsets[id + 1]; ++pair) visit(id, pair, place[pairs.tiles[pair]]++);
+    }
+  };
+  parallel_for(kChunks, 1, threads, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t chunk = begin; chunk < end; ++chunk) each_pair(chunk, [](std::uint32_t, std::uint32_t, std::uint32_t) {});
+  });
   std::uint32_t next = 0;
   for (std::size_t tile = 0; tile < tiles; ++tile) {
-    tiling.tile_offsets[tile] = next;
-    for (Chunk& chunk : chunks) next += std::exchange(chunk.counts[tile], next);
+    lists.offsets[tile] = next;
+    for (std::size_t chunk = 0; chunk < kChunks; ++chunk) next += std::exchange(places[chunk * tiles + tile], next);
   }
-  tiling.tile_offsets[tiles] = next;
-  if (with_slots) {
-    tiling.slots = make_buffer<std::uint32_t>(total);
-    tiling.rank_offsets = make_buffer<std::uint32_t>(count + 1);
-    tiling.rank_offsets[count] = tiling.count;
-  }
-  parallel_for(kChunks, 1, threads, [&](std::size_t first, std::size_t last) {
-    for (std::size_t i = first; i < last; ++i) {
-      Chunk& chunk = chunks[i];
-      std::size_t pair = 0;
-      const auto [begin, end] = bounds(i);
-      for (std::size_t r = begin; r < end; ++r) {
-        if (with_slots) tiling.rank_offsets[r] = chunk.first_pair + static_cast<std::uint32_t>(pair);
-        for (std::uint32_t k = 0; k < chunk.per_rank[r - begin]; ++k, ++pair) {
-          const std::uint32_t place = chunk.counts[chunk.tiles[pair]]++;
-          tiling.isects[place] = static_cast<std::uint32_t>(r);
-          if (with_slots) tiling.slots[chunk.first_pair + pair] = place;
-        }
-      }
-    }
+  lists.offsets[tiles] = next;
+  parallel_for(kChunks, 1, threads, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t chunk = begin; chunk < end; ++chunk)
+      each_pair(chunk, [&](std::uint32_t id, std::uint32_t pair, std::uint32_t place) {
+        lists.isects[place] = id;
+        if (with_slots) lists.slots[place] = pair;
+      });
   });
-  return tiling;
+  return lists;
 }
 
 }  // namespace cap4d
