@@ -63,8 +63,12 @@ class _Array(_Record):
     pass
 
 
-class _Sparse(_Record):
-    pass
+class _Columns(_Record):
+    """A csc matrix."""
+
+
+class _Rows(_Record):
+    """A csr matrix."""
 
 
 class _Chumpy(_Record):
@@ -75,6 +79,11 @@ def _encode(text: str, encoding: str) -> bytes:
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
         raise ValueError(f"text encoded as {encoding!r}")
     return text.encode("latin1")
+
+
+def _no_bytes() -> bytes:
+    """Old protocols write empty bytes as a call of `bytes` without arguments."""
+    return b""
 
 
 def _reconstruct(kind: type, *_: Any) -> _Record:
@@ -89,6 +98,8 @@ _NAMES: dict[str, Any] = {
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy._core.multiarray._reconstruct": _reconstruct,
     "_codecs.encode": _encode,
+    "__builtin__.bytes": _no_bytes,
+    "builtins.bytes": _no_bytes,
     "copy_reg._reconstructor": _reconstruct,
     "copyreg._reconstructor": _reconstruct,
     "__builtin__.object": _Record,
@@ -97,11 +108,8 @@ _NAMES: dict[str, Any] = {
     "builtins.set": _Record,
     "chumpy.ch.Ch": _Chumpy,
 }
-_NAMES |= {
-    f"scipy.sparse.{module}.{kind}_matrix": _Sparse
-    for kind in ("csc", "csr")
-    for module in (kind, f"_{kind}")
-}
+_NAMES |= {f"scipy.sparse.{module}.csc_matrix": _Columns for module in ("csc", "_csc")}
+_NAMES |= {f"scipy.sparse.{module}.csr_matrix": _Rows for module in ("csr", "_csr")}
 
 _BROKEN = (
     pickle.UnpicklingError,
@@ -137,7 +145,7 @@ def _plain(path: Path, key: str, value: Any) -> Any:
             value = value.state["x"]
         if isinstance(value, _Array):
             return _array(value)
-        if isinstance(value, _Sparse):
+        if isinstance(value, (_Columns, _Rows)):
             return _dense(value)
     except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
         raise DataError(path, key, expected="an array", found=repr(error)) from error
@@ -166,15 +174,14 @@ def _element(record: _Dtype) -> np.dtype:
     return np.dtype(order + code)
 
 
-def _dense(record: _Sparse) -> np.ndarray:
+def _dense(record: _Columns | _Rows) -> np.ndarray:
     """A compressed sparse matrix as a dense one: data and indices between indptr[i] and indptr[i + 1] belong
     to line i.
     """
     state = record.state
     data, indices, indptr = (_array(state[name]) for name in ("data", "indices", "indptr"))
     shape = tuple(int(n) for n in state.get("_shape", state.get("shape")))
-    by_column = state.get("format", "csc") == "csc"
-    lines, width = shape[::-1] if by_column else shape
+    lines, width = shape[::-1] if isinstance(record, _Columns) else shape
     if not 0 < lines * width <= MAX_BYTES // 8 or len(indptr) != lines + 1:
         raise ValueError(f"sparse matrix of shape {shape}")
     counts = np.diff(indptr.astype(np.int64))
@@ -184,4 +191,4 @@ def _dense(record: _Sparse) -> np.ndarray:
         raise ValueError("sparse matrix with an index out of range")
     dense = np.zeros((lines, width))
     np.add.at(dense, (np.repeat(np.arange(lines), counts), indices), data)
-    return dense.T if by_column else dense
+    return dense.T if isinstance(record, _Columns) else dense
