@@ -102,6 +102,9 @@ def _manifest(bundle: Bundle, counts: dict[str, int], precision: str, entries: d
     on_mesh = stored_subject(bundle) is not bundle.subject
     if on_mesh:
         _check_mixture(bundle)
+    if np.shape(bundle.expression_range) != (counts["expressions"], 2):
+        found = np.shape(bundle.expression_range)
+        raise ArgumentError(f"expression_range: expected [{counts['expressions']}, 2], got {found}")
     if bundle.idle.rig_name != bundle.rig_name:
         raise ArgumentError(
             f"idle: expected a clip for {bundle.rig_name}, got one for {bundle.idle.rig_name}"
