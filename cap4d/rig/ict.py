@@ -18,6 +18,7 @@ from cap4d.rig.atlas import add_skirts, enlarge_busy, islands, place, unmirror, 
 from cap4d.rig.bust import grow_bust, open_edge
 from cap4d.rig.head import HeadRig
 from cap4d.rig.ict_source import IctModel, read_ict
+from cap4d.rig.ict_teeth import front_strip
 from cap4d.rig.obj import triangulate
 
 NAME = "ict_facekit_light"
@@ -55,11 +56,12 @@ BOXES = {
     "bust": (88.495, 0.495, 127.6, 61.505),  # its ends, which meet at the back, lie on pixel centres
     "eye_left": (88, 108, 108, 128),
     "eye_right": (108, 108, 128, 128),
-    "teeth": (88, 82, 114, 108),
-    "mouth_socket": (114, 90, 128, 108),
-    "eye_socket_left": (114, 82, 121, 90),
-    "eye_socket_right": (121, 82, 128, 90),
-    "gums": (88, 62, 128, 82),
+    "teeth_upper": (88, 97.5, 128, 108),
+    "teeth_lower": (88, 87, 128, 96.5),
+    "gums": (88, 62, 114, 87),
+    "mouth_socket": (114, 69, 128, 87),
+    "eye_socket_left": (114, 62, 121, 69),
+    "eye_socket_right": (121, 62, 128, 69),
 }
 EYE_R, EYE_L = slice(36, 42), slice(42, 48)  # in LANDMARKS
 SKIRT = 0.65 / 128  # of the atlas
@@ -144,6 +146,7 @@ def _mesh(model: IctModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     vertex.
     """
     faces, uv_faces = triangulate(model.faces, model.uv_faces)
+    all_faces = faces
     parts = _part_of_faces(faces, model.uvs[uv_faces].mean(1))
     kept = parts >= 0
     faces, parts = faces[kept], parts[kept]
@@ -157,14 +160,26 @@ def _mesh(model: IctModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
         if tile == "face":
             uvs[ids] = enlarge_busy(uvs[ids], _importance(points[vertex[ids]], points), strength=FACE_WARP)
         uvs[ids] = place(uvs[ids], _box(tile))
+    for row in ("teeth_upper", "teeth_lower"):
+        strip = front_strip(points, _of(all_faces, row), _of(all_faces, "gums"), upper=row == "teeth_upper")
+        faces = np.concatenate([faces, strip[0]])
+        uv_faces = np.concatenate([uv_faces, strip[2] + len(uvs)])
+        uvs = np.concatenate([uvs, place(strip[1], _box(row))])
+        tiles = np.concatenate([tiles, np.full(len(strip[1]), row, tiles.dtype)])
     return faces, uvs, uv_faces, tiles
+
+
+def _of(faces: np.ndarray, part: str) -> np.ndarray:
+    start, end = {**RANGES, "teeth_upper": (17039, 19247), "teeth_lower": (19247, 21451)}[part]
+    return faces[(faces[:, 0] >= start) & (faces[:, 0] < end)]
 
 
 def _part_of_faces(faces: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """int[F] index into RANGES, -1 for faces that are left out. `centres` [F, 2] are in the model's UVs."""
     parts = np.full(len(faces), -1)
     for index, part in enumerate(RANGES):
-        parts[_in_range(faces[:, 0], part)] = index
+        if part != "teeth":  # they get texture of their own
+            parts[_in_range(faces[:, 0], part)] = index
         if part.startswith("eye_") and part != "eye_sockets":
             back = np.hypot(*(centres - 0.5).T) > 0.5  # the front is a disc in the middle of the tile
             parts[(parts == index) & back] = -1

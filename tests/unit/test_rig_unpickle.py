@@ -9,7 +9,6 @@ import types
 
 import numpy as np
 import pytest
-
 from cap4d.errors import DataError
 from cap4d.rig.unpickle import read_pickle
 
@@ -135,7 +134,7 @@ def test_sparse_index_out_of_range(tmp_path):
     sparse = pytest.importorskip("scipy.sparse")
     matrix = sparse.csc_matrix(np.eye(3))
     matrix.indices[1] = 7
-    with pytest.raises(DataError, match="J: expected an array, found .*out of range"):
+    with pytest.raises(DataError, match=r"J: expected an array, found .*out of range"):
         read_pickle(write(tmp_path / "a.pkl", {"J": matrix}))
 
 
