@@ -65,7 +65,7 @@ class SplatPass:
     Args:
         ctx: OpenGL 4.1 or newer.
         gaussians: What to draw.
-        texture_type: "f4", or "f2" for half the bandwidth at some 60 dB.
+        texture_type: "f4", or "f2" for half the bandwidth at 57 dB of PSNR.
     """
 
     def __init__(self, ctx: moderngl.Context, gaussians: BoundGaussians, *, texture_type: str = "f4") -> None:

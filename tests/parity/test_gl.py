@@ -1,0 +1,88 @@
+"""OpenGL draws what the CPU renderer draws, on every software driver of Mesa."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gl_scenes import NO_DRIVER, avatar_views, scenes
+from tiny_bundle import tiny_bundle
+
+from cap4d.player.avatar import Avatar
+
+DRIVERS = {
+    "llvmpipe": {"LIBGL_ALWAYS_SOFTWARE": "1", "GALLIUM_DRIVER": "llvmpipe"},
+    "zink": {"LIBGL_ALWAYS_SOFTWARE": "1", "MESA_LOADER_DRIVER_OVERRIDE": "zink"},
+}
+
+# Least PSNR on white, dB, and largest difference of a channel. Float blending and the tiles' arithmetic agree
+# to rounding, except that one alone may skip a contribution near 1/255, and that blending cannot stop.
+TOLERANCE = {
+    "default": (65, 1.5 / 255),
+    "opaque": (55, 1e-2),  # a pixel stops with up to 1 % of its light left where alpha is clamped at 0.99
+    "degenerate": (50, 0.05),  # the frame of a triangle without area is rounding, normalised
+    "half": (50, 2.5 / 255),  # RGBA16F
+}
+
+
+@pytest.fixture(scope="session", params=DRIVERS)
+def pictures(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, np.ndarray]:
+    """What gl_scenes.py draws with one driver, in a process of its own."""
+    output = tmp_path_factory.mktemp("gl") / "pictures.npz"
+    here = Path(__file__).resolve().parent
+    environment = os.environ | DRIVERS[request.param] | {"PYTHONPATH": str(here.parent)}
+    program = [sys.executable, here / "gl_scenes.py", output]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=300)
+    if done.returncode == NO_DRIVER:
+        pytest.skip(f"{request.param}: {done.stderr.strip().splitlines()[-1]}")
+    assert done.returncode == 0, done.stderr
+    found = dict(np.load(output))
+    if request.param not in str(found["driver"]):
+        pytest.skip(f"{request.param} is not installed: got {found['driver']}")
+    return found
+
+
+def on_white(picture: np.ndarray) -> np.ndarray:
+    return picture[..., :3] + 1 - picture[..., 3:]
+
+
+def psnr(a: np.ndarray, b: np.ndarray, peak: float = 1.0) -> float:
+    error = np.mean((a.astype(np.float64) - b) ** 2)
+    return float(10 * np.log10(peak**2 / max(error, 1e-12)))
+
+
+@pytest.mark.parametrize("name", [*scenes(), "half thousands"])
+def test_a_scene_looks_the_same(name, pictures):
+    expected = scenes()[name.removeprefix("half ")].on_cpu()
+    least, most = TOLERANCE.get(name.split()[0], TOLERANCE["default"])
+    found = pictures[name]
+    assert found.shape == expected.shape
+    assert np.abs(on_white(found) - on_white(expected)).max() <= most
+    assert psnr(on_white(found), on_white(expected)) >= least
+
+
+def test_the_scenes_show_something():
+    """Else every renderer that draws nothing would pass."""
+    for name, scene in scenes().items():
+        picture = scene.on_cpu()
+        assert picture[..., 3].max() > 0.015, name
+        assert name == "one pixel" or on_white(picture).std() > 0.002, name
+
+
+def test_no_gaussians_are_no_picture(pictures):
+    assert not pictures["empty"].any()
+
+
+def test_frames_of_an_avatar_are_those_of_the_cpu_renderer(pictures):
+    avatar = Avatar(tiny_bundle(24, sh_degree=2, network=False))
+    for index, camera in enumerate(avatar_views()):
+        expected = avatar.draw(avatar.idle.frame(index), camera, background=(1, 1, 1))
+        found = pictures[f"avatar {index}"]
+        assert found.dtype == np.uint8
+        assert found.shape == expected.shape
+        assert np.abs(found.astype(int) - expected).max() <= 2
+        assert psnr(found, expected, 255) >= 60
