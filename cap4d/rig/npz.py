@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import zipfile
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -107,7 +108,7 @@ def _read_array(path: Path, name: str, stream, size: int) -> np.ndarray:
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
         shape, fortran, dtype = read_header(stream)
-    except (ValueError, KeyError, EOFError) as error:
+    except (ValueError, KeyError, EOFError, TypeError, SyntaxError, TokenError, RecursionError) as error:
         raise DataError(path, name, expected="a NumPy array header", found=error) from error
     if dtype.hasobject or dtype.names:
         raise DataError(path, name, expected="plain numbers or text", found=f"dtype {dtype}")
