@@ -1,7 +1,7 @@
 """Synthetic captures: a rig seen by known cameras with known expressions, rendered from its coloured mesh.
 
-Ground truth for tests and material for the demo: what fit.npz says is exactly what the images show. The light is fixed
-to the head, as the avatar's colours are.
+Ground truth for tests and material for the demo: what fit.npz says is exactly what the images show. The light
+is fixed to the head, as the avatar's colours are.
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ from cap4d.rotation import axis_angle_to_rotmat
 from cap4d.synth.idle import VISEMES, expression_vector, look_weights, speaks_arkit
 
 DISTANCE, FOV_DEG = 1.1, 17.5  # m and degrees of every camera
-TARGET = np.array([0.0, 0.015, 0.0])  # m, OpenCV axes: the middle of what the cameras see, a little below the eyes
+TARGET = np.array(
+    [0.0, 0.015, 0.0]
+)  # m, OpenCV axes: the middle of what the cameras see, a little below the eyes
 SUPERSAMPLE = 2
 NEUTRAL_COLOR = (0.80, 0.62, 0.54)  # of rigs without colours
-# Lights in the head's frame (OpenCV axes: -y is up, -z in front of the face): direction to the light, strength.
+# Lights in the head's frame (OpenCV axes: -y is up, -z in front of the face): direction to the light,
+# strength.
 LIGHTS = (((-0.45, -0.75, -1.0), 0.42), ((0.9, -0.15, -0.7), 0.17), ((0.3, -0.5, 1.0), 0.12))
 SKY, GROUND = 0.60, 0.40  # light without direction, from above and from below
 
@@ -77,7 +80,9 @@ def synthesize(
 
 def head_vertices(subject: Subject, performance: Performance, t: int) -> np.ndarray:
     """[V, 3] frame t in the head-fixed frame, OpenCV axes."""
-    posed = subject.pose(performance.expr[t], eye_rot=performance.eye_rot[t], neck_rot=performance.neck_rot[t])
+    posed = subject.pose(
+        performance.expr[t], eye_rot=performance.eye_rot[t], neck_rot=performance.neck_rot[t]
+    )
     return opencv_from_rig(posed.astype(np.float64))
 
 
@@ -116,14 +121,20 @@ def _perform(rig: HeadRig, frames: int, rng: np.random.Generator) -> Performance
     }
     for value in poses.values():
         value[0] = 0
-    expr = _named_expressions(rig, poses["eye_rot"], rng) if speaks_arkit(rig) else _random_expressions(rig, frames, rng)
+    expr = (
+        _named_expressions(rig, poses["eye_rot"], rng)
+        if speaks_arkit(rig)
+        else _random_expressions(rig, frames, rng)
+    )
     expr[0] = 0
     poses = {name: value.astype(np.float32) for name, value in poses.items()}
     return Performance(expr.astype(np.float32), **poses)
 
 
 def _named_expressions(rig: HeadRig, gaze: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Mouth shapes of speech in every second frame, a few single expressions in the others; blinks and lids in all."""
+    """Mouth shapes of speech in every second frame, a few single expressions in the others; blinks and lids
+    in all.
+    """
     n, lids = len(rig.expression_names), ("eyeblink", "eyelook", "mouthclose")
     single = [i for i, name in enumerate(rig.expression_names) if not name.lower().startswith(lids)]
     low, high = rig.expression_range.T
@@ -147,7 +158,9 @@ def _random_expressions(rig: HeadRig, frames: int, rng: np.random.Generator) -> 
     return np.clip(rng.normal(0, 0.25 / (1 + np.arange(n) / 10), (frames, n)) * (high - low), low, high)
 
 
-def _save(rig: HeadRig, output: Path, cameras: dict[str, Camera], performance: Performance, valid: np.ndarray) -> None:
+def _save(
+    rig: HeadRig, output: Path, cameras: dict[str, Camera], performance: Performance, valid: np.ndarray
+) -> None:
     for name in cameras:
         (output / "images" / name).mkdir(parents=True, exist_ok=True)
         (output / "bg" / name).mkdir(parents=True, exist_ok=True)
@@ -162,7 +175,9 @@ def _save(rig: HeadRig, output: Path, cameras: dict[str, Camera], performance: P
         neck_rot=performance.neck_rot,
         cameras=cameras,
         valid=valid,
-        references=[(name, t) for c, name in enumerate(cameras) for t in range(len(performance.expr)) if valid[c, t]],
+        references=[
+            (name, t) for c, name in enumerate(cameras) for t in range(len(performance.expr)) if valid[c, t]
+        ],
     )
 
 
@@ -189,12 +204,16 @@ def _mottle(rig: HeadRig) -> np.ndarray:
 
 
 def _glint(normals: np.ndarray) -> np.ndarray:
-    """The key light's reflection for a viewer in front of the face (fixed, so that it does not wander with the view)."""
+    """The key light's reflection for a viewer in front of the face (fixed, so that it does not wander with
+    the view).
+    """
     half = np.array(LIGHTS[0][0]) / np.linalg.norm(LIGHTS[0][0]) + [0, 0, -1]
     return 0.8 * np.clip(normals @ (half / np.linalg.norm(half)), 0, 1) ** 160
 
 
-def _draw(vertices: np.ndarray, faces: np.ndarray, shades: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def _draw(
+    vertices: np.ndarray, faces: np.ndarray, shades: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
     """Straight sRGB [H, W, 3] and coverage [H, W] of the mesh."""
     n = SUPERSAMPLE
     fragments = rasterize_mesh(vertices, faces, camera.resized(camera.width * n, camera.height * n))

@@ -44,7 +44,11 @@ def idle_clip(rig: HeadRig | Subject, *, fps: float = 30.0, seconds: float = 8.0
     rng = np.random.default_rng(seed)
     times = np.arange(max(1, round(fps * seconds))) / fps
     gaze = _gaze(rng, times, seconds)
-    expr = _by_name(rig, rng, times, seconds, gaze) if speaks_arkit(rig) else _by_number(rig, rng, times, seconds)
+    expr = (
+        _by_name(rig, rng, times, seconds, gaze)
+        if speaks_arkit(rig)
+        else _by_number(rig, rng, times, seconds)
+    )
     neck = np.radians([1.6, 2.4, 1.0]) * _drift(rng, times, seconds, 3)
     zeros = np.zeros((len(times), 3), np.float32)
     name = rig.name if isinstance(rig, HeadRig) else rig.rig_name
@@ -73,7 +77,9 @@ def expression_vector(rig: HeadRig | Subject, weights: Mapping[str, float]) -> n
 
 
 def look_weights(gaze: np.ndarray) -> dict[str, float]:
-    """How the lids follow a gaze [3] (axis-angle, rad; positive x looks down, positive y to the person's left)."""
+    """How the lids follow a gaze [3] (axis-angle, rad; positive x looks down, positive y to the person's
+    left).
+    """
     down, left = np.asarray(gaze[:2]) / FULL_LOOK
     return {
         "eyeLookDown": max(down, 0.0),
@@ -91,7 +97,9 @@ def _plain(name: str) -> str:
     return name.replace("_", "").lower()
 
 
-def _by_name(rig, rng: np.random.Generator, times: np.ndarray, seconds: float, gaze: np.ndarray) -> np.ndarray:
+def _by_name(
+    rig, rng: np.random.Generator, times: np.ndarray, seconds: float, gaze: np.ndarray
+) -> np.ndarray:
     expr = np.zeros((len(times), len(rig.expression_names)))
     talk_end = 0.55 * seconds
     for weights, start, width in _syllables(rng, 0.08 * seconds, talk_end):
@@ -109,7 +117,9 @@ def _by_name(rig, rng: np.random.Generator, times: np.ndarray, seconds: float, g
 
 
 def _by_number(rig, rng: np.random.Generator, times: np.ndarray, seconds: float) -> np.ndarray:
-    """Smooth coefficients within a quarter of their range; the last one blinks where it is CAP4D's blink (fact 4)."""
+    """Smooth coefficients within a quarter of their range; the last one blinks where it is CAP4D's blink
+    (fact 4).
+    """
     n = len(rig.expression_names)
     span = np.asarray(rig.expression_range) if isinstance(rig, HeadRig) else np.tile([-1.0, 1.0], (n, 1))
     falloff = 1 / (1 + np.arange(n) / 8)
@@ -120,7 +130,9 @@ def _by_number(rig, rng: np.random.Generator, times: np.ndarray, seconds: float)
 
 
 def _drift(rng: np.random.Generator, times: np.ndarray, seconds: float, channels: int) -> np.ndarray:
-    """[T, channels] slow noise of about unit size made of a few harmonics of the clip's length, zero at its start."""
+    """[T, channels] slow noise of about unit size made of a few harmonics of the clip's length, zero at its
+    start.
+    """
     harmonics = np.arange(1, 1 + max(2, round(seconds * 0.45)))
     phases = 2 * np.pi * (times[:, None] / seconds) * harmonics
     waves = np.concatenate([np.sin(phases), np.cos(phases) - 1], 1)

@@ -1,7 +1,8 @@
-"""The built-in head: a friendly human head modelled by this code alone, so that everything works with nothing downloaded.
+"""The built-in head: a friendly human head modelled by this code alone, so that everything works with nothing
+downloaded.
 
-field.py is its form, skin.py the mesh of its skin, parts.py what is set into it, paint.py its colours, identity.py and
-expressions.py how it varies and moves, atlas.py its UVs.
+field.py is its form, skin.py the mesh of its skin, parts.py what is set into it, paint.py its colours,
+identity.py and expressions.py how it varies and moves, atlas.py its UVs.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ MM = 1e-3
 
 def build_mesh() -> Mesh:
     """The neutral head in millimetres, with the marks its parts carry."""
-    teeth = build_teeth("teeth_upper", 1, 24, 80, -55, -44), build_teeth("teeth_lower", -1, 22, 77.5, -55.3, -63.5)
+    teeth = (
+        build_teeth("teeth_upper", 1, 24, 79, -55, -44),
+        build_teeth("teeth_lower", -1, 22, 76.5, -55.3, -63.5),
+    )
     parts = [*_build_skin(), build_eye(), *teeth, build_tongue(), build_ear(), build_hair(), build_shirt()]
     return assemble([paint(p) for p in parts], left_uv, right_uv)
 
@@ -43,7 +47,12 @@ def regions(mesh: Mesh) -> dict[str, np.ndarray]:
     """Named vertex ids; see `HeadRig.regions`."""
     row, column = mesh.marks["row"], mesh.marks["column"]
     skin, rigid = mesh.of("skin"), mesh.of("eye", "teeth_upper", "teeth_lower", "shirt")
-    lips = skin & (row >= row_of("upper_vermilion")) & (row <= row_of("lower_vermilion")) & (column <= CORNER_COLUMN)
+    lips = (
+        skin
+        & (row >= row_of("upper_vermilion"))
+        & (row <= row_of("lower_vermilion"))
+        & (column <= CORNER_COLUMN)
+    )
     masks = {
         "head": ~mesh.of("shirt") & ~(skin & (row > row_of("throat"))),
         "deformable": ~rigid,
@@ -60,7 +69,9 @@ def regions(mesh: Mesh) -> dict[str, np.ndarray]:
 
 
 def build_head() -> HeadRig:
-    """The built-in rig: 28 identity modes, the 52 ARKit expressions, neck and eyes, colours. The same bits every time."""
+    """The built-in rig: 28 identity modes, the 52 ARKit expressions, neck and eyes, colours. The same bits
+    every time.
+    """
     mesh = build_mesh()
     joints = np.stack([NECK, EYE, EYE * [-1, 1, 1]])
     identity, joints_identity, _ = identity_modes(mesh, joints)

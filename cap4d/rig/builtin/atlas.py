@@ -1,4 +1,6 @@
-"""Where each part lies in the UV square: one face, and below it a band with everything else, apart by gutters."""
+"""Where each part lies in the UV square: one face, and below it a band with everything else, apart by
+gutters.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +8,20 @@ import numpy as np
 
 from cap4d.rig.builtin.sheet import Part
 
-PIXELS = 128  # the atlas is laid out for a grid of this many pixels a side; gutters are 2 of them or more
+PIXELS = 128  # the atlas is laid out for a grid of this many pixels a side; gutters are 2 of them
 # x0, y0, x1, y1 in those pixels, y up: one rectangle for a part with a midline, two (left, right) for a pair.
+# Edges that
+# should appear in the grid lie a hair outside pixel centres.
 PLACES = {
-    "skin": ((1, 40, 127, 127),),
-    "hair": ((1, 1, 41, 37.5),),
-    "shirt": ((43.5, 1, 73.5, 37.5),),
-    "eye": ((109.5, 19.5, 127, 37.5), (89.5, 19.5, 107, 37.5)),
-    "ear": ((109.5, 1, 127, 17), (89.5, 1, 107, 17)),
-    "mouth": ((75.5, 26, 87.5, 37.5),),
-    "teeth_upper": ((75.5, 18.2, 87.5, 23.8),),
-    "teeth_lower": ((75.5, 10.4, 87.5, 16),),
-    "tongue": ((75.5, 1, 87.5, 8.2),),
+    "skin": ((0.48, 40, 127.52, 127),),
+    "hair": ((0.48, 0.48, 41.52, 37.52),),
+    "shirt": ((44.48, 0.48, 73.52, 37.52),),
+    "eye": ((110, 19.5, 127.6, 37.6), (90.4, 19.5, 108, 37.6)),
+    "ear": ((110.48, 0.48, 127.52, 16.52), (90.48, 0.48, 107.52, 16.52)),
+    "mouth": ((76.48, 26.48, 87.52, 37.52),),
+    "teeth_upper": ((76.48, 18.48, 87.52, 23.52),),
+    "teeth_lower": ((76.48, 10.48, 87.52, 15.52),),
+    "tongue": ((76.48, 0.48, 87.52, 7.52),),
 }
 
 

@@ -1,7 +1,7 @@
 """The 52 ARKit expressions of the built-in head, each a sum of a few muscle-like moves.
 
-A left-hand move is written once, for the person's left (x > 0); the right-hand one is its mirror image.
-All in millimetres; an expression's offsets are those at weight 1.
+A left-hand move is written once, for the person's left (x > 0); the right-hand one is its mirror image. All
+in millimetres; an expression's offsets are those at weight 1.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class Face:
         lip: [V] 1 on the red of the lips and inside, falling to 0 over a centimetre of skin around.
         lid: [V] 1 upper lid, -1 lower lid, 0 neither; `lid_share` how far it follows its rim.
         close: [V] rad about the eyeball's lateral axis by which a vertex's rim turns to meet the other lid.
-        seams: pairs of vertex arrays (pouch, skin) that lie on each other, and for each pouch vertex its place in
+        seams: pairs of vertex arrays (pouch, skin) that lie on each other, and for each pouch vertex its
+            place in
             between: see `lining`.
     """
 
@@ -50,8 +51,14 @@ class Face:
     mesh: Mesh
 
     def lump(self, centre: tuple, size: tuple, move: tuple) -> np.ndarray:
-        """[V, 3] `move` (mm) spread as a Gaussian of half widths `size` (x, y) about `centre` on the face's front."""
-        share = np.exp(-(((self.p[:, :2] - centre) / size) ** 2).sum(1)) * smoothstep(5, 35, self.p[:, 2]) * self.skin
+        """[V, 3] `move` (mm) spread as a Gaussian of half widths `size` (x, y) about `centre` on the face's
+        front.
+        """
+        share = (
+            np.exp(-(((self.p[:, :2] - centre) / size) ** 2).sum(1))
+            * smoothstep(5, 35, self.p[:, 2])
+            * self.skin
+        )
         return share[:, None] * np.array(move, float)
 
     def upper(self, offsets: np.ndarray) -> np.ndarray:
@@ -73,15 +80,17 @@ class Face:
 
     def turn_jaw(self, angles: tuple, shift: tuple = (0, 0, 0)) -> np.ndarray:
         """[V, 3] the lower jaw turned about its hinge (rad about x then y) and shifted (mm)."""
-        ax, ay = angles
-        about_x = np.array([[1, 0, 0], [0, np.cos(ax), -np.sin(ax)], [0, np.sin(ax), np.cos(ax)]])
-        about_y = np.array([[np.cos(ay), 0, np.sin(ay)], [0, 1, 0], [-np.sin(ay), 0, np.cos(ay)]])
-        arm = self.p - HINGE
-        return self.jaw[:, None] * (arm @ (about_y @ about_x).T - arm + np.array(shift, float))
+        return self.jaw[:, None] * (turned(self.p, *angles) + np.array(shift, float))
 
     def lids(self, upper: float, lower: float) -> np.ndarray:
         """[V, 3] the left eye's lids turned about the eyeball: 1 closes, negative opens wider."""
-        amount = np.where(self.lid > 0, upper, lower) * self.close * self.lid_share * (self.lid != 0) * (self.p[:, 0] > 0)
+        amount = (
+            np.where(self.lid > 0, upper, lower)
+            * self.close
+            * self.lid_share
+            * (self.lid != 0)
+            * (self.p[:, 0] > 0)
+        )
         arm = self.p - EYE
         radius = np.hypot(arm[:, 1], arm[:, 2])
         angle = np.arctan2(arm[:, 1], arm[:, 2]) + amount
@@ -96,16 +105,23 @@ class Face:
     def line_mouth(self, offsets: np.ndarray) -> np.ndarray:
         """The offsets with the mouth's lining following the lips it hangs on."""
         ids, ends, share = self.lining
-        first, last = offsets[ends[:, 0]], offsets[ends[:, 1]]
+        hung = (1 - share)[:, None] * offsets[ends[:, 0]] + share[:, None] * offsets[ends[:, 1]]
         loose = (1 - np.sin(np.pi * share) ** 0.7)[:, None]
-        jaw_first, jaw_last = self.jaw[ends[:, 0]][:, None], self.jaw[ends[:, 1]][:, None]
-        own = self.jaw[ids][:, None]
-        mixed = (1 - share[:, None]) * first + share[:, None] * last
         offsets = offsets.copy()
-        rigid = offsets[ids] if own.any() else 0 * mixed
-        offsets[ids] = loose * mixed + (1 - loose) * rigid
-        del jaw_first, jaw_last
+        offsets[ids] = loose * hung + (1 - loose) * offsets[ids]
         return offsets
+
+
+def turned(p: np.ndarray, about_x: float, about_y: float) -> np.ndarray:
+    """[V, 3] how points move that turn with the lower jaw about its hinge (rad about x, then y)."""
+    tilt = np.array(
+        [[1, 0, 0], [0, np.cos(about_x), -np.sin(about_x)], [0, np.sin(about_x), np.cos(about_x)]]
+    )
+    swing = np.array(
+        [[np.cos(about_y), 0, np.sin(about_y)], [0, 1, 0], [-np.sin(about_y), 0, np.cos(about_y)]]
+    )
+    arm = p - HINGE
+    return arm @ (swing @ tilt).T - arm
 
 
 def read_face(mesh: Mesh) -> Face:
@@ -119,13 +135,29 @@ def read_face(mesh: Mesh) -> Face:
     jaw = np.where(skin, jaw, 0)
     jaw[mesh.of("teeth_lower")] = 1
     jaw[mesh.of("tongue")] = smoothstep(15, 45, p[mesh.of("tongue"), 2]) * 0.97
-    jaw[pouch] = smoothstep(0.25, 0.75, mesh.marks["row"][pouch]) * smoothstep(10, 40, p[pouch, 2])
+    sidewall = _at_corner(theta[pouch])
+    jaw[pouch] = (1 - sidewall) * smoothstep(0.25, 0.75, row[pouch]) + 0.5 * sidewall
+    jaw[pouch] *= smoothstep(10, 40, p[pouch, 2])
     top, bottom = row_of("upper_vermilion"), row_of("lower_vermilion")
-    lip = smoothstep(top - 6, top + 1, row) * smoothstep(bottom + 6, bottom - 1, row) * smoothstep(CORNER + 12, CORNER - 1, theta)
+    lip = (
+        smoothstep(top - 6, top + 1, row)
+        * smoothstep(bottom + 6, bottom - 1, row)
+        * smoothstep(CORNER + 12, CORNER - 1, theta)
+    )
     lid, share, close = _lids(p, row, column, skin, grid)
     return Face(
-        p, skin, pouch, np.where(skin, below, 0), jaw, np.where(skin, lip, 0), lid, share, close,
-        mesh.of("eye"), _lining(mesh), mesh,
+        p,
+        skin,
+        pouch,
+        np.where(skin, below, 0),
+        jaw,
+        np.where(skin, lip, 0),
+        lid,
+        share,
+        close,
+        mesh.of("eye"),
+        _lining(mesh),
+        mesh,
     )
 
 
@@ -148,15 +180,24 @@ def _below(p: np.ndarray, row: np.ndarray, theta: np.ndarray, skin: np.ndarray) 
     width = 7 + 0.75 * beyond
     line = LIP_LINE - 0.5 - 0.02 * beyond
     slope = smoothstep(-width, width, line - p[:, 1])
-    at_corner = 1 - np.maximum(1 - np.minimum(theta / CORNER, 1) ** 2.2, 0) ** 0.75
+    at_corner = _at_corner(theta)
     opening = (row >= row_of("upper_vermilion") - 8) & (row <= row_of("chin"))
     step = np.where(opening, lower, slope)
     return at_corner * slope + (1 - at_corner) * step
 
 
+def _at_corner(theta: np.ndarray) -> np.ndarray:
+    """0 at the mouth's middle, 1 at its corner and beyond; what is left of 1 is the shape of the open mouth."""
+    return 1 - np.maximum(1 - np.minimum(theta / CORNER, 1) ** 2.2, 0) ** 0.75
+
+
 def _above_neck(row: np.ndarray, theta: np.ndarray) -> np.ndarray:
     jaw, throat, collar = row_of("jaw"), row_of("throat"), row_of("collar")
-    return 1 - 0.75 * smoothstep(jaw + 1, throat, row) - 0.25 * smoothstep(throat, throat + 0.6 * (collar - throat), row)
+    return (
+        1
+        - 0.75 * smoothstep(jaw + 1, throat, row)
+        - 0.25 * smoothstep(throat, throat + 0.6 * (collar - throat), row)
+    )
 
 
 def _lids(p, row, column, skin, grid):
@@ -169,7 +210,9 @@ def _lids(p, row, column, skin, grid):
     arm = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], -1) - EYE
     angle = np.arctan2(arm[:, 1], arm[:, 2])
     in_eye = skin & (column > CORNER_COLUMN) & (column < OUTER_COLUMN)
-    lid = np.where(in_eye & (row <= upper) & (row > row_of("hair")), 1, 0) - np.where(in_eye & (row >= lower) & (row < row_of("nose")), 1, 0)
+    lid = np.where(in_eye & (row <= upper) & (row > row_of("hair")), 1, 0) - np.where(
+        in_eye & (row >= lower) & (row < row_of("nose")), 1, 0
+    )
     top, bottom = np.radians(50.0), np.radians(-48.0)
     share = np.where(
         lid > 0,
@@ -182,7 +225,9 @@ def _lids(p, row, column, skin, grid):
 
 
 def _lining(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For every vertex of the pouch: its id, the skin vertices behind the upper and lower lip it hangs on, its place."""
+    """For every vertex of the pouch: its id, the skin vertices behind the upper and lower lip it hangs on,
+    its place.
+    """
     marks = mesh.marks
     ids = np.flatnonzero(mesh.of("mouth"))
     ends = np.zeros((len(ids), 2), int)
@@ -214,11 +259,17 @@ def eye_blink(f: Face) -> np.ndarray:
 
 def look(upper: float, lower: float, aside: float) -> Move:
     """Lids that follow the gaze; `aside` mm towards the temple."""
-    return lambda f: f.lids(upper, lower) + f.lump((33, 20), (11, 6), (aside, 0, 0)) * (f.lid_share**2)[:, None]
+    return lambda f: (
+        f.lids(upper, lower) + f.lump((33, 20), (11, 6), (aside, 0, 0)) * (f.lid_share**2)[:, None]
+    )
 
 
 def eye_squint(f: Face) -> np.ndarray:
-    return f.lids(0.14, 2.2) + f.lump((38, 2), (16, 9), (0, 1.6, 0.9)) + f.lump((51, 17), (7, 8), (-0.8, -0.2, 0.3))
+    return (
+        f.lids(0.14, 2.2)
+        + f.lump((38, 2), (16, 9), (0, 1.6, 0.9))
+        + f.lump((51, 17), (7, 8), (-0.8, -0.2, 0.3))
+    )
 
 
 def eye_wide(f: Face) -> np.ndarray:
@@ -240,55 +291,45 @@ def jaw_left(f: Face) -> np.ndarray:
 
 
 def mouth_close(f: Face) -> np.ndarray:
-    """What brings the lips together again under an open jaw (ARKit: at the same weight as jawOpen)."""
-    opened = jaw_open(f)
-    rows = f.mesh.marks["row"]
-    reach_low = smoothstep(row_of("chin") - 1, row_of("lower_vermilion") - 3, rows)
-    reach_up = smoothstep(row_of("nose") + 1, row_of("upper_vermilion") + 2, rows)
-    gap = _column_gap(f, opened)
-    low = rows >= row_of("lower_lip")
-    rim = smoothstep(row_of("upper_lip") - 5, row_of("upper_lip"), rows) * smoothstep(row_of("lower_lip") + 5, row_of("lower_lip"), rows)
-    lateral = smoothstep(CORNER_COLUMN + 0.5, CORNER_COLUMN - 9, f.mesh.marks["column"])
-    share = np.where(low, -0.62 * reach_low, 0.38 * reach_up) * f.skin * (rim + (1 - rim) * lateral)
-    return share[:, None] * gap
+    """What brings the lips together again under an open jaw (ARKit: at the same weight as jawOpen).
 
-
-def _column_gap(f: Face, offsets: np.ndarray) -> np.ndarray:
-    """[V, 3] how far the lower rim moves away from the upper one in the vertex's column, zero beyond the mouth."""
-    marks = f.mesh.marks
-    gap = np.zeros((len(f.p), 3))
-    rims = []
-    for key in ("upper_lip", "lower_lip"):
-        ids = np.flatnonzero(f.skin & (marks["row"] == row_of(key)) & (marks["depth"] == 0) & (marks["column"] < CORNER_COLUMN))
-        rims.append(ids)
-    table = {}
-    for key, ids in zip((0, 1), rims, strict=True):
-        for i in ids:
-            table[key, int(marks["column"][i]), f.p[i, 0] < -1e-6] = offsets[i]
-    for column in range(CORNER_COLUMN):
-        for right in (False, True):
-            if (0, column, right) in table:
-                mine = f.skin & (marks["column"] == column) & ((f.p[:, 0] < -1e-6) == right)
-                gap[mine] = table[1, column, right] - table[0, column, right]
-    return gap
+    Both lips then ride along with half the jaw's turn, as the mouth's corners do.
+    """
+    row, column = f.mesh.marks["row"], f.mesh.marks["column"]
+    half_way = 0.5 * turned(f.p, JAW_OPEN, 0.0)
+    reach = smoothstep(row_of("nose") + 1, row_of("upper_vermilion") + 2, row)
+    reach = reach * smoothstep(row_of("chin") - 1, row_of("lower_vermilion") - 3, row)
+    rim = smoothstep(row_of("upper_vermilion") - 2, row_of("upper_lip") - 2, row)
+    rim = rim * smoothstep(row_of("lower_vermilion") + 2, row_of("lower_lip") + 2, row)
+    aside = rim * smoothstep(CORNER_COLUMN + 6, CORNER_COLUMN, column)
+    aside = aside + (1 - rim) * smoothstep(CORNER_COLUMN + 5, CORNER_COLUMN - 7, column)
+    return (reach * aside * f.skin)[:, None] * (half_way - jaw_open(f))
 
 
 def mouth_funnel(f: Face) -> np.ndarray:
     corners = f.lump_both((23, -54), (11, 12), (-6.5, 0, 3.0))
     rim = f.lump((0, -54), (22, 15), (0, 0, 6.0))
-    part = f.upper(f.lump((0, -50), (13, 10), (0, 3.6, 1.5))) + f.lower(f.lump((0, -59), (13, 11), (0, -4.4, 1.5)))
+    part = f.upper(f.lump((0, -50), (13, 10), (0, 3.6, 1.5))) + f.lower(
+        f.lump((0, -59), (13, 11), (0, -4.4, 1.5))
+    )
     return corners + rim + part + f.turn_jaw((np.radians(3.0), 0))
 
 
 def mouth_pucker(f: Face) -> np.ndarray:
     corners = f.lump_both((23, -54), (12, 12), (-9.5, 0, 4.0))
     rim = f.lump((0, -54), (18, 13), (0, 0, 7.0))
-    plump = f.upper(f.lump((0, -49), (12, 6), (0, 1.6, 0.5))) + f.lower(f.lump((0, -60), (12, 6), (0, -1.6, 0.5)))
+    plump = f.upper(f.lump((0, -49), (12, 6), (0, 1.6, 0.5))) + f.lower(
+        f.lump((0, -60), (12, 6), (0, -1.6, 0.5))
+    )
     return corners + rim + plump
 
 
 def mouth_left(f: Face) -> np.ndarray:
-    return f.lump((0, -54), (34, 18), (7.0, 0, 0)) + f.lump((27, -54), (12, 12), (1.0, 0.8, -3.0)) + f.lump((-25, -54), (12, 12), (0.6, 0, 1.6))
+    return (
+        f.lump((0, -54), (34, 18), (7.0, 0, 0))
+        + f.lump((27, -54), (12, 12), (1.0, 0.8, -3.0))
+        + f.lump((-25, -54), (12, 12), (0.6, 0, 1.6))
+    )
 
 
 def mouth_smile(f: Face) -> np.ndarray:
@@ -301,15 +342,27 @@ def mouth_smile(f: Face) -> np.ndarray:
 
 
 def mouth_frown(f: Face) -> np.ndarray:
-    return _corner(f, (1.2, -6.5, -1.2), (11, 12)) + f.lump((22, -70), (10, 9), (0.5, -1.8, 1.0)) + f.lower(f.lump((0, -62), (14, 7), (0, 0.9, 0.6)))
+    return (
+        _corner(f, (1.2, -6.5, -1.2), (11, 12))
+        + f.lump((22, -70), (10, 9), (0.5, -1.8, 1.0))
+        + f.lower(f.lump((0, -62), (14, 7), (0, 0.9, 0.6)))
+    )
 
 
 def mouth_dimple(f: Face) -> np.ndarray:
-    return _corner(f, (5.0, 1.0, -3.8), (9, 9)) + f.lump((33, -52), (5, 8), (0.5, 0, -2.2)) + f.lump((40, -45), (8, 12), (1.2, 0.5, 1.4))
+    return (
+        _corner(f, (5.0, 1.0, -3.8), (9, 9))
+        + f.lump((33, -52), (5, 8), (0.5, 0, -2.2))
+        + f.lump((40, -45), (8, 12), (1.2, 0.5, 1.4))
+    )
 
 
 def mouth_stretch(f: Face) -> np.ndarray:
-    return _corner(f, (7.5, -3.0, -4.6), (12, 13)) + f.lower(f.lump((12, -62), (13, 9), (2.2, -1.6, -1.0))) + f.lump((26, -80), (12, 14), (2.0, -1.5, 0))
+    return (
+        _corner(f, (7.5, -3.0, -4.6), (12, 13))
+        + f.lower(f.lump((12, -62), (13, 9), (2.2, -1.6, -1.0)))
+        + f.lump((26, -80), (12, 14), (2.0, -1.5, 0))
+    )
 
 
 def mouth_roll_lower(f: Face) -> np.ndarray:
@@ -323,12 +376,16 @@ def mouth_roll_upper(f: Face) -> np.ndarray:
 
 
 def mouth_shrug_lower(f: Face) -> np.ndarray:
-    lip = f.lower(f.lump((0, -58), (20, 8), (0, 4.6, 2.6))) + f.upper(f.lump((0, -51), (17, 6), (0, 3.2, 1.0)))
+    lip = f.lower(f.lump((0, -58), (20, 8), (0, 4.6, 2.6))) + f.upper(
+        f.lump((0, -51), (17, 6), (0, 3.2, 1.0))
+    )
     return lip + f.lump((0, -84), (17, 11), (0, 4.4, 0.6)) + f.lump_both((22, -56), (7, 7), (0, -1.6, 0))
 
 
 def mouth_shrug_upper(f: Face) -> np.ndarray:
-    return f.upper(f.lump((0, -49), (18, 9), (0, 3.8, 2.0))) + f.lower(f.lump((0, -57), (15, 5), (0, 3.0, 1.4)))
+    return f.upper(f.lump((0, -49), (18, 9), (0, 3.8, 2.0))) + f.lower(
+        f.lump((0, -57), (15, 5), (0, 3.0, 1.4))
+    )
 
 
 def mouth_press(f: Face) -> np.ndarray:
@@ -338,7 +395,9 @@ def mouth_press(f: Face) -> np.ndarray:
 
 
 def mouth_lower_down(f: Face) -> np.ndarray:
-    return f.lower(f.lump((12, -58), (12, 11), (1.4, -7.0, -0.6))) + f.lump((15, -76), (12, 9), (0.4, -1.8, 0.6))
+    return f.lower(f.lump((12, -58), (12, 11), (1.4, -7.0, -0.6))) + f.lump(
+        (15, -76), (12, 9), (0.4, -1.8, 0.6)
+    )
 
 
 def mouth_upper_up(f: Face) -> np.ndarray:
@@ -346,7 +405,11 @@ def mouth_upper_up(f: Face) -> np.ndarray:
 
 
 def brow_down(f: Face) -> np.ndarray:
-    return f.lump((17, 41), (13, 9), (-3.0, -5.2, 1.0)) + f.lump((38, 42), (13, 8), (-0.6, -3.0, 0)) + f.lids(0.10, 0)
+    return (
+        f.lump((17, 41), (13, 9), (-3.0, -5.2, 1.0))
+        + f.lump((38, 42), (13, 8), (-0.6, -3.0, 0))
+        + f.lids(0.10, 0)
+    )
 
 
 def brow_inner_up(f: Face) -> np.ndarray:
@@ -354,7 +417,11 @@ def brow_inner_up(f: Face) -> np.ndarray:
 
 
 def brow_outer_up(f: Face) -> np.ndarray:
-    return f.lump((42, 42), (14, 10), (0.4, 7.0, -0.8)) + f.lump((40, 62), (18, 11), (0, 2.0, 0)) + f.lids(-0.06, 0)
+    return (
+        f.lump((42, 42), (14, 10), (0.4, 7.0, -0.8))
+        + f.lump((40, 62), (18, 11), (0, 2.0, 0))
+        + f.lids(-0.06, 0)
+    )
 
 
 def cheek_puff(f: Face) -> np.ndarray:
@@ -363,13 +430,22 @@ def cheek_puff(f: Face) -> np.ndarray:
 
 
 def cheek_squint(f: Face) -> np.ndarray:
-    return f.lump((39, -10), (16, 13), (0.6, 5.0, 2.8)) + f.lids(0.04, 1.7) + f.lump((30, -30), (12, 10), (0.6, 2.0, 0.6))
+    return (
+        f.lump((39, -10), (16, 13), (0.6, 5.0, 2.8))
+        + f.lids(0.04, 1.7)
+        + f.lump((30, -30), (12, 10), (0.6, 2.0, 0.6))
+    )
 
 
 def nose_sneer(f: Face) -> np.ndarray:
     wing = f.lump((12, -20), (8, 10), (1.4, 4.6, 0.4))
     bridge = f.lump((9, 8), (6, 10), (-0.6, -1.0, 1.4)) + f.lump((14, 30), (9, 9), (-1.0, -2.2, 0.8))
-    return wing + bridge + f.upper(f.lump((12, -44), (9, 9), (0.4, 2.8, 0.6))) + f.lump((20, -28), (7, 10), (0.5, 2.6, 1.0))
+    return (
+        wing
+        + bridge
+        + f.upper(f.lump((12, -44), (9, 9), (0.4, 2.8, 0.6)))
+        + f.lump((20, -28), (7, 10), (0.5, 2.6, 1.0))
+    )
 
 
 def tongue_out(f: Face) -> np.ndarray:
@@ -378,9 +454,13 @@ def tongue_out(f: Face) -> np.ndarray:
     open_ = f.turn_jaw((np.radians(7.5), 0)) * (~tongue)[:, None]
     tip = np.where(tongue, f.mesh.marks["tip"], 0)
     out = smoothstep(0.25, 0.95, tip)
-    move = np.stack([0 * tip, -6.5 * smoothstep(0.2, 0.7, tip) - 9.0 * smoothstep(0.72, 1.0, tip), 32 * out], -1)
+    move = np.stack(
+        [0 * tip, -6.5 * smoothstep(0.2, 0.7, tip) - 9.0 * smoothstep(0.72, 1.0, tip), 32 * out], -1
+    )
     flat = np.stack([-0.05 * f.p[:, 0], -0.35 * (f.p[:, 1] + 60), 0 * tip], -1) * out[:, None]
-    lips = f.lower(f.lump((0, -57), (15, 8), (0, -2.2, 0.6))) + f.upper(f.lump((0, -50), (14, 7), (0, 1.0, 0)))
+    lips = f.lower(f.lump((0, -57), (15, 8), (0, -2.2, 0.6))) + f.upper(
+        f.lump((0, -50), (14, 7), (0, 1.0, 0))
+    )
     return open_ + (move + flat) * tongue[:, None] + lips
 
 

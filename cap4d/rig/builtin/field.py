@@ -1,7 +1,9 @@
-"""The head's form as one smooth implicit surface: round solids melted into each other, the way a sculptor adds clay.
+"""The head's form as one smooth implicit surface: round solids melted into each other, the way a sculptor
+adds clay.
 
-Everything is in millimetres in the rig's axes and symmetric in x. Only the broad form lives here; lips, lids, ears
-and hair are laid on later (skin.py, parts.py). The melting is the polynomial smooth minimum (Quilez 2013).
+Everything is in millimetres in the rig's axes and symmetric in x. Only the broad form lives here; lips, lids,
+ears and hair are laid on later (skin.py, parts.py). The melting is the polynomial smooth minimum (Quilez
+2013).
 """
 
 from __future__ import annotations
@@ -16,8 +18,9 @@ LID_RADIUS = 17.4  # the outer surface of the lids, a sphere about the same cent
 def ellipsoid(p: np.ndarray, centre: tuple, radii: tuple) -> np.ndarray:
     """[N] approximate distance of p [N, 3] to an ellipsoid, exact on its surface to first order."""
     q = (p - np.array(centre)) / np.array(radii)
-    near = np.sqrt((q * q).sum(-1)) + 1e-9
-    slope = np.sqrt(((q / np.array(radii)) ** 2).sum(-1)) + 1e-9
+    squares = q * q
+    near = np.sqrt(squares @ np.ones(3)) + 1e-9
+    slope = np.sqrt(squares @ (1.0 / np.square(radii))) + 1e-9
     return near * (near - 1) / slope
 
 
@@ -26,7 +29,7 @@ def bone(p: np.ndarray, a: tuple, b: tuple, radius_a: float, radius_b: float) ->
     a, axis = np.array(a, float), np.array(b, float) - np.array(a, float)
     along = np.clip((p - a) @ axis / (axis @ axis), 0, 1)
     off = p - a - along[:, None] * axis
-    return np.sqrt((off * off).sum(-1)) - (radius_a + (radius_b - radius_a) * along)
+    return np.sqrt((off * off) @ np.ones(3)) - (radius_a + (radius_b - radius_a) * along)
 
 
 def melt(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
@@ -57,7 +60,9 @@ def head_distance(points: np.ndarray) -> np.ndarray:
     d = melt(d, ellipsoid(p, tuple(EYE), (LID_RADIUS,) * 3), 6)  # lids
     d = melt(d, nose_distance(p), 10)
     d = melt(d, bone(p, (0, -10, -30), (0, -230, -44), 44, 53), 30)  # neck
-    return melt(d, bone(p, (50, -56, -22), (15, -170, 2), 7, 6), 18)  # the muscle from behind the ear to the throat
+    return melt(
+        d, bone(p, (50, -56, -22), (15, -170, 2), 7, 6), 18
+    )  # the muscle from behind the ear to the throat
 
 
 def nose_distance(p: np.ndarray) -> np.ndarray:
@@ -69,7 +74,9 @@ def nose_distance(p: np.ndarray) -> np.ndarray:
 
 
 def cast(origins: np.ndarray, directions: np.ndarray, start: float = 150.0, steps: int = 24) -> np.ndarray:
-    """[N, 3] the outermost surface points on rays, found by sphere tracing from `start` mm back to the origin."""
+    """[N, 3] the outermost surface points on rays, found by sphere tracing from `start` mm back to the
+    origin.
+    """
     reach = np.full(len(origins), start)
     for _ in range(steps):
         reach -= 0.95 * head_distance(origins + reach[:, None] * directions)

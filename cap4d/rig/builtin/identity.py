@@ -26,7 +26,9 @@ def _above_shirt(p: np.ndarray) -> np.ndarray:
     return smoothstep(-190, -120, p[:, 1])
 
 
-def _along(x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float, share: np.ndarray) -> np.ndarray:
+def _along(
+    x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float, share: np.ndarray
+) -> np.ndarray:
     return np.stack(np.broadcast_arrays(x, y, z), -1) * share[:, None]
 
 
@@ -40,7 +42,12 @@ FIELDS: dict[str, Field] = {
     "head_height": lambda p: _along(0, 1, 0, 6.0 * smoothstep(25, 130, p[:, 1])),
     "head_depth": lambda p: _along(0, 0, 0.035 * p[:, 2], _above_shirt(p)),
     "face_length": lambda p: _along(0, -1, 0, 4.5 * smoothstep(15, -100, p[:, 1])),
-    "jaw_width": lambda p: _along(0.07 * p[:, 0], 0, 0, smoothstep(0, -55, p[:, 1]) * smoothstep(-130, -95, p[:, 1]) * smoothstep(-45, 10, p[:, 2])),
+    "jaw_width": lambda p: _along(
+        0.07 * p[:, 0],
+        0,
+        0,
+        smoothstep(0, -55, p[:, 1]) * smoothstep(-130, -95, p[:, 1]) * smoothstep(-45, 10, p[:, 2]),
+    ),
     "chin_length": lambda p: _along(0, -1, 0.15, 3.6 * _near(p, (0, -98, 66), (30, 22, 34))),
     "chin_forward": lambda p: _along(0, 0, 1, 3.2 * _near(p, (0, -90, 76), (26, 22, 34))),
     "nose_size": lambda p: (p - [0, -8, 82]) * (0.11 * _near(p, (0, -12, 95), (17, 24, 22)))[:, None],
@@ -54,15 +61,29 @@ FIELDS: dict[str, Field] = {
     "eye_tilt": lambda p: _along(0, 0.09 * (np.abs(p[:, 0]) - 33), 0, _near(p, (33, 20, 70), (22, 13, 30))),
     "mouth_width": lambda p: _along(0.08 * p[:, 0], 0, 0, _near(p, (0, -54, 84), (38, 17, 34))),
     "mouth_height": lambda p: _along(0, 1, 0, 2.0 * _near(p, (0, -54, 84), (36, 17, 40))),
-    "cheek_fullness": lambda p: _along(1.0 * _side(p), -0.1, 0.6, 3.2 * _near(p, (44, -38, 46), (22, 27, 30))),
+    "cheek_fullness": lambda p: _along(
+        1.0 * _side(p), -0.1, 0.6, 3.2 * _near(p, (44, -38, 46), (22, 27, 30))
+    ),
     "cheekbones": lambda p: _along(0.8 * _side(p), 0.2, 0.7, 2.3 * _near(p, (48, -8, 52), (20, 15, 24))),
     "brow_ridge": lambda p: _along(0, -0.3, 1, 1.9 * _near(p, (22, 40, 80), (30, 9, 22))),
     "brow_height": lambda p: _along(0, 1, 0, 2.2 * _near(p, (28, 42, 78), (32, 9, 26))),
     "forehead_slope": lambda p: _along(0, 0, -1, 4.0 * smoothstep(42, 110, p[:, 1]) * _front(p)),
-    "ear_size": lambda p: (p - np.stack([68 * np.sign(p[:, 0]), 0 * p[:, 1], 0 * p[:, 2] - 8], -1)) * (0.10 * _near(p, (77, 2, -14), (13, 38, 22)))[:, None],
-    "ear_stand": lambda p: _along(np.sign(p[:, 0]), 0, 0, 3.0 * smoothstep(-4, -26, p[:, 2]) * _near(p, (82, 4, -22), (12, 30, 18))),
-    "neck_width": lambda p: _along(0.06 * p[:, 0], 0, 0.06 * (p[:, 2] + 35), smoothstep(-75, -125, p[:, 1]) * smoothstep(-260, -180, p[:, 1])),
-    "lip_fullness": lambda p: _along(0, 0.16 * (p[:, 1] + 53.5), 1.3, _near(p, (0, -54, 90), (22, 10.5, 16)) * _front(p)),
+    "ear_size": lambda p: (
+        (p - np.stack([68 * np.sign(p[:, 0]), 0 * p[:, 1], 0 * p[:, 2] - 8], -1))
+        * (0.10 * _near(p, (77, 2, -14), (13, 38, 22)))[:, None]
+    ),
+    "ear_stand": lambda p: _along(
+        np.sign(p[:, 0]), 0, 0, 3.0 * smoothstep(-4, -26, p[:, 2]) * _near(p, (82, 4, -22), (12, 30, 18))
+    ),
+    "neck_width": lambda p: _along(
+        0.06 * p[:, 0],
+        0,
+        0.06 * (p[:, 2] + 35),
+        smoothstep(-75, -125, p[:, 1]) * smoothstep(-260, -180, p[:, 1]),
+    ),
+    "lip_fullness": lambda p: _along(
+        0, 0.16 * (p[:, 1] + 53.5), 1.3, _near(p, (0, -54, 90), (22, 10.5, 16)) * _front(p)
+    ),
 }
 EYE_SCALE = 0.045  # the one mode that is not a field of places alone: the ball grows with its lids
 
@@ -74,14 +95,18 @@ def carried(field: Field, p: np.ndarray, ball: np.ndarray) -> np.ndarray:
         p: [N, 3] mm.
         ball: bool[N] points of the eyeballs.
     """
-    centre = np.stack([EYE[0] * np.where(p[:, 0] < 0, -1, 1), np.full(len(p), EYE[1]), np.full(len(p), EYE[2])], -1)
+    centre = np.stack(
+        [EYE[0] * np.where(p[:, 0] < 0, -1, 1), np.full(len(p), EYE[1]), np.full(len(p), EYE[2])], -1
+    )
     rigid = np.where(ball, 1, smoothstep(30, 20, np.linalg.norm(p - centre, axis=1)))[:, None]
     at_eye = field(np.stack([EYE, EYE * [-1, 1, 1]]))
     return (1 - rigid) * field(p) + rigid * np.where(p[:, :1] < 0, at_eye[1], at_eye[0])
 
 
 def eye_size(p: np.ndarray) -> np.ndarray:
-    centre = np.stack([EYE[0] * np.where(p[:, 0] < 0, -1, 1), np.full(len(p), EYE[1]), np.full(len(p), EYE[2])], -1)
+    centre = np.stack(
+        [EYE[0] * np.where(p[:, 0] < 0, -1, 1), np.full(len(p), EYE[1]), np.full(len(p), EYE[2])], -1
+    )
     arm = p - centre
     return EYE_SCALE * arm * smoothstep(38, 20, np.linalg.norm(arm, axis=1))[:, None]
 

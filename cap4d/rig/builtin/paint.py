@@ -31,7 +31,9 @@ def _spot(p: np.ndarray, centre: tuple, size: tuple) -> np.ndarray:
 
 
 def brow_share(p: np.ndarray) -> np.ndarray:
-    """[N] how much of a point is eyebrow: a band that arches from over the inner corner to the temple and tapers."""
+    """[N] how much of a point is eyebrow: a band that arches from over the inner corner to the temple and
+    tapers.
+    """
     x = np.abs(p[:, 0])
     t = np.clip((x - 13.0) / 39, 0, 1)
     middle = 38.6 + 6.6 * np.sin(np.pi * np.clip(t * 0.92, 0, 1) ** 1.2) - 3.0 * t
@@ -43,25 +45,41 @@ def brow_share(p: np.ndarray) -> np.ndarray:
 def paint_skin(part: Part) -> Part:
     p, row, column, depth = part.points, part.marks["row"], part.marks["column"], part.marks["depth"]
     c = np.tile(np.array(SKIN), (len(p), 1))
-    blush = 0.42 * _spot(p, (40, -20), (17, 14)) + 0.38 * _spot(p, (0, -17), (13, 9)) + 0.15 * _spot(p, (0, -88), (16, 10))
+    blush = (
+        0.42 * _spot(p, (40, -20), (17, 14))
+        + 0.38 * _spot(p, (0, -17), (13, 9))
+        + 0.15 * _spot(p, (0, -88), (16, 10))
+    )
     c = _blend(c, BLUSH, blush)
-    c = _blend(c, (0.80, 0.56, 0.50), 0.35 * _spot(p, tuple(EYE[:2]), (19, 12)))  # thinner skin about the eyes
+    c = _blend(
+        c, (0.80, 0.56, 0.50), 0.35 * _spot(p, tuple(EYE[:2]), (19, 12))
+    )  # thinner skin about the eyes
     c = _blend(c, (0.35, 0.13, 0.11), 0.9 * _spot(p, (5.6, -29.0), (3.0, 2.0)) * (p[:, 2] > 80))  # nostrils
     top, bottom = row_of("upper_vermilion"), row_of("lower_vermilion")
     upper, lower = row_of("upper_lip"), row_of("lower_lip")
     reach = smoothstep(CORNER_COLUMN + 0.6, CORNER_COLUMN - 1.5, column)
     edge = np.minimum(smoothstep(top - 0.6, top + 1.2, row), smoothstep(bottom + 0.6, bottom - 1.2, row))
     c = _blend(c, LIPS, 0.92 * edge * reach)
-    seam = np.maximum(smoothstep(upper - 2, upper, row) * (row <= upper), smoothstep(lower + 2, lower, row) * (row >= lower))
+    seam = np.maximum(
+        smoothstep(upper - 2, upper, row) * (row <= upper), smoothstep(lower + 2, lower, row) * (row >= lower)
+    )
     in_mouth = (column <= CORNER_COLUMN) * 1.0
-    c = _blend(c, (0.55, 0.25, 0.25), 0.55 * seam * in_mouth * smoothstep(CORNER_COLUMN + 0.5, CORNER_COLUMN - 3, column))
+    c = _blend(
+        c,
+        (0.55, 0.25, 0.25),
+        0.55 * seam * in_mouth * smoothstep(CORNER_COLUMN + 0.5, CORNER_COLUMN - 3, column),
+    )
     lip_inside = (depth > 0) & (row >= upper)
     c = _blend(c, LINING, np.where(lip_inside, np.clip(0.25 * depth, 0, 1), 0))
     eye_top, eye_bottom = row_of("upper_lid"), row_of("lower_lid")
     in_eye = ((column >= CORNER_COLUMN) & (column <= OUTER_COLUMN)) * 1.0
-    lash = in_eye * ((row == eye_top) | ((row == eye_bottom) & (depth == 0) & False)) * np.where(depth <= 1, 1.0, 0.35)
-    c = _blend(c, (0.13, 0.09, 0.08), 0.92 * lash * smoothstep(CORNER_COLUMN - 0.5, CORNER_COLUMN + 4, column))
-    c = _blend(c, (0.72, 0.42, 0.38), 0.55 * in_eye * (row == eye_bottom) * (depth >= 1))  # the wet rim below
+    c = _blend(
+        c, (0.72, 0.42, 0.38), 0.55 * in_eye * ((row == eye_bottom) | (row == eye_top)) * (depth >= 1)
+    )  # the wet rims
+    lash = in_eye * (row == eye_top) * np.where(depth == 0, 1.0, np.where(depth == 1, 0.5, 0.0))
+    c = _blend(
+        c, (0.13, 0.09, 0.08), 0.92 * lash * smoothstep(CORNER_COLUMN - 0.5, CORNER_COLUMN + 4, column)
+    )
     c = _blend(c, (0.62, 0.40, 0.34), 0.35 * in_eye * (row == eye_bottom) * (depth == 0))
     c = _blend(c, BROW, 0.93 * brow_share(p) * (depth == 0))
     shadow = smoothstep(row_of("jaw") - 2, row_of("throat"), row) * smoothstep(110, 60, column * 2.0)
@@ -76,7 +94,9 @@ def paint_eye(part: Part) -> Part:
     c = _blend(c, IRIS_OUTER, smoothstep(IRIS + 0.02, IRIS, a))
     fibres = 0.5 + 0.5 * np.sin(10 * turn) * np.sin(23 * turn + 1)
     c = _blend(c, IRIS_INNER, smoothstep(IRIS - 0.03, PUPIL + 0.07, a) * (0.65 + 0.35 * fibres))
-    c = _blend(c, (0.09, 0.13, 0.16), smoothstep(IRIS - 0.06, IRIS, a) * smoothstep(IRIS + 0.05, IRIS, a) * 0.7)
+    c = _blend(
+        c, (0.09, 0.13, 0.16), smoothstep(IRIS - 0.06, IRIS, a) * smoothstep(IRIS + 0.05, IRIS, a) * 0.7
+    )
     return replace(part, colors=_blend(c, (0.02, 0.02, 0.025), smoothstep(PUPIL + 0.008, PUPIL - 0.012, a)))
 
 
@@ -84,7 +104,9 @@ def paint_teeth(part: Part) -> Part:
     share, gap = part.marks["enamel"], part.marks["gap"]
     c = np.tile([0.965, 0.945, 0.905], (len(share), 1))
     c = _blend(c, (0.62, 0.50, 0.42), 0.55 * np.clip(1 - gap, 0, 1))
-    return replace(part, colors=_blend(c, (0.80, 0.45, 0.44), smoothstep(0.10, 0.02, share + 0.1 * (gap - 1))))
+    return replace(
+        part, colors=_blend(c, (0.80, 0.45, 0.44), smoothstep(0.10, 0.02, share + 0.1 * (gap - 1)))
+    )
 
 
 def paint_tongue(part: Part) -> Part:

@@ -1,4 +1,6 @@
-"""What is set into the skin or worn on it: eyeballs, teeth, tongue, ears, hair, shirt. Half of each, in millimetres."""
+"""What is set into the skin or worn on it: eyeballs, teeth, tongue, ears, hair, shirt. Half of each, in
+millimetres.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ PUPIL, IRIS = 0.165, 0.445  # rad from the gaze axis
 MOUTH_HEIGHT = -53.5
 
 
-def grid_part(name: str, points: np.ndarray, uv: np.ndarray, *, pole: bool = False, ring: bool = False, **marks) -> Part:
+def grid_part(
+    name: str, points: np.ndarray, uv: np.ndarray, *, pole: bool = False, ring: bool = False, **marks
+) -> Part:
     """A part of one grid [R, C, 3]; `pole`: its first row is one point; `ring`: its last column is its first."""
     rows, columns = points.shape[:2]
     ids = np.arange(rows * columns).reshape(rows, columns)
@@ -29,18 +33,59 @@ def grid_part(name: str, points: np.ndarray, uv: np.ndarray, *, pole: bool = Fal
 
 
 def disc_uv(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """[..., 2] a point of the unit square at `radius` in [0, 1] from its middle; angle 0 is up, growing to the right."""
+    """[..., 2] a point of the unit square at `radius` in [0, 1] from its middle; angle 0 is up, growing to
+    the right.
+    """
     return 0.5 + 0.5 * np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1)
+
+
+def square_uv(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """The same with the rim on the square's edges, so that it stays straight in the grid."""
+    sin, cos = np.sin(angle), np.cos(angle)
+    return 0.5 + 0.5 * (radius / np.maximum(np.abs(sin), np.abs(cos)))[..., None] * np.stack([sin, cos], -1)
+
+
+def fan_uv(radius: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """[..., 2] for a half part about a pole: the pole at the top's middle, the rim on the other edges.
+
+    Args:
+        radius: In [0, 1] from the pole to the rim.
+        azimuth: rad, 0 in front (straight down) to pi behind (straight to the right).
+    """
+    u, v = np.moveaxis(square_uv(radius, np.pi - 0.5 * azimuth), -1, 0)
+    return np.stack([u, 2 * v], -1)
 
 
 def build_eye() -> Part:
     """The front of an eyeball: rings about the gaze, close together where pupil and iris end."""
-    rings = np.array([0, 0.08, 0.150, PUPIL, 0.18, 0.26, 0.34, 0.41, IRIS - 0.015, IRIS + 0.01, 0.5, 0.6, 0.75, 0.95, 1.2, 1.5, 1.75])
+    rings = np.array(
+        [
+            0,
+            0.08,
+            0.150,
+            PUPIL,
+            0.18,
+            0.26,
+            0.34,
+            0.41,
+            IRIS - 0.015,
+            IRIS + 0.01,
+            0.5,
+            0.6,
+            0.75,
+            0.95,
+            1.2,
+            1.4,
+            1.6,
+        ]
+    )
     around = np.linspace(0, 2 * np.pi, 41)
     a, phi = np.meshgrid(rings, around, indexing="ij")
     radius = EYE_RADIUS + 0.35 * smoothstep(IRIS + 0.05, 0.1, a)
-    points = EYE + radius[..., None] * np.stack([np.sin(a) * np.sin(phi), np.sin(a) * np.cos(phi), np.cos(a)], -1)
-    uv = disc_uv((a / rings[-1]) ** 0.8, phi)
+    points = EYE + radius[..., None] * np.stack(
+        [np.sin(a) * np.sin(phi), np.sin(a) * np.cos(phi), np.cos(a)], -1
+    )
+    uv = disc_uv((a / rings[-1]) ** 0.62, phi)
     return grid_part("eye", points[:, ::-1], uv[:, ::-1], pole=True, ring=True, angle=a, turn=phi[:, ::-1])
 
 
@@ -51,7 +96,8 @@ def arch(tau: np.ndarray, width: float, front: float, depth: float) -> tuple[np.
 
 
 def build_teeth(name: str, sign: float, width: float, front: float, edge: float, gum: float) -> Part:
-    """A row of teeth with its gum: from behind the gum's top over the front of the crowns to behind their edges.
+    """A row of teeth with its gum: from behind the gum's top over the front of the crowns to behind their
+    edges.
 
     Args:
         sign: 1 for the upper row, -1 for the lower.
@@ -66,19 +112,45 @@ def build_teeth(name: str, sign: float, width: float, front: float, edge: float,
     crown = 1 - np.abs(2 * across - 1) ** 5
     gap = 1 - np.abs(2 * across - 1) ** 8
     # rows: height share from gum (0) to edge (1), how far forward (mm), which share of the scallop shows
-    rows = np.array([[-0.75, -2.5, 0], [-0.35, 0.6, 0], [-0.04, 0.8, 0.2], [0.06, 0.2, 0.6], [0.3, 0.9, 1], [0.6, 1.1, 1], [0.85, 0.8, 1], [0.97, 0.2, 1], [1.0, -0.8, 0.8], [0.7, -3.2, 0.2]])
+    rows = np.array(
+        [
+            [-0.75, -2.5, 0],
+            [-0.35, 0.6, 0],
+            [-0.04, 0.8, 0.2],
+            [0.06, 0.2, 0.6],
+            [0.3, 0.9, 1],
+            [0.6, 1.1, 1],
+            [0.85, 0.8, 1],
+            [0.97, 0.2, 1],
+            [1.0, -0.8, 0.8],
+            [0.7, -3.2, 0.2],
+        ]
+    )
     normal = np.stack([x * 0.55 + 1e-9, 0 * x, np.full_like(x, 18.0)], -1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     height = gum + (edge - gum) * rows[:, :1]
     scallop = 0.9 * (gap - 1) * rows[:, 2:]
     rounding = sign * 0.9 * (1 - crown) * smoothstep(0.5, 1.0, rows[:, :1])
-    points = np.stack([np.broadcast_to(x, height.shape[:1] + x.shape), height + rounding, np.broadcast_to(z, height.shape[:1] + x.shape)], -1)
+    points = np.stack(
+        [
+            np.broadcast_to(x, height.shape[:1] + x.shape),
+            height + rounding,
+            np.broadcast_to(z, height.shape[:1] + x.shape),
+        ],
+        -1,
+    )
     points = points + (rows[:, 1:2] + scallop)[..., None] * normal
     points[:, 0, 0] = 0
     order = slice(None) if sign > 0 else slice(None, None, -1)
     u, v = np.meshgrid(np.linspace(0.5, 1, len(tau)), np.linspace(1, 0, len(rows)))
     share = np.broadcast_to(rows[:, :1], v.shape)
-    return grid_part(name, points[order], np.stack([u, v], -1), enamel=share[order], gap=np.broadcast_to(gap, v.shape)[order])
+    return grid_part(
+        name,
+        points[order],
+        np.stack([u, v], -1),
+        enamel=share[order],
+        gap=np.broadcast_to(gap, v.shape)[order],
+    )
 
 
 def build_tongue() -> Part:
@@ -86,19 +158,26 @@ def build_tongue() -> Part:
     s, phi = np.meshgrid(np.linspace(0, 1, 15), np.linspace(0, np.pi, 13), indexing="ij")
     along = np.pi * s
     girth = np.sin(along) ** 0.62
-    points = np.stack([
-        17 * girth * np.sin(phi),
-        -62 + 6.0 * girth * np.cos(phi) - 1.2 * girth * np.exp(-((phi / 0.35) ** 2)) + 3 * np.sin(along * 0.5) ** 2,
-        46 + 25 * np.cos(along),
-    ], -1)
+    points = np.stack(
+        [
+            17 * girth * np.sin(phi),
+            -62
+            + 6.0 * girth * np.cos(phi)
+            - 1.2 * girth * np.exp(-((phi / 0.35) ** 2))
+            + 3 * np.sin(along * 0.5) ** 2,
+            46 + 25 * np.cos(along),
+        ],
+        -1,
+    )
     points[:, [0, -1], 0] = 0
     uv = np.stack([0.5 + 0.5 * phi / np.pi, 1 - s], -1)
-    uv = disc_uv(s, np.pi - phi) if False else np.stack([0.5 + 0.5 * np.sin(phi / 2) * 1.0, 1 - s], -1)
     return grid_part("tongue", points[:, ::-1][:, ::-1], uv, pole=True, tip=1 - s)
 
 
 def build_ear() -> Part:
-    """An ear as a disc seen from its side: bowl, inner ridge, groove, rolled rim; then its back down to the head."""
+    """An ear as a disc seen from its side: bowl, inner ridge, groove, rolled rim; then its back down to the
+    head.
+    """
     rho = np.concatenate([np.linspace(0, 1, 17), [1.0, 0.97, 0.88, 0.76, 0.66]])
     back = np.arange(len(rho)) > 16
     phi = np.linspace(0, 2 * np.pi, 49)  # 0 is up, growing towards the face
@@ -111,27 +190,58 @@ def build_ear() -> Part:
     lobe = smoothstep(-0.45, -0.95, np.cos(f) * np.minimum(r * 1.2, 1))
     face = smoothstep(0.2, 0.9, fore)
     bump = lambda c, w: np.exp(-(((r - c) / w) ** 2))  # noqa: E731
-    height = -6.5 * smoothstep(0.52, 0.12, r) + 3.0 * bump(0.62, 0.12) * (1 - face) - 1.8 * bump(0.78, 0.07) * (1 - face)
+    height = (
+        -6.5 * smoothstep(0.52, 0.12, r)
+        + 3.0 * bump(0.62, 0.12) * (1 - face)
+        - 1.8 * bump(0.78, 0.07) * (1 - face)
+    )
     height += 3.6 * bump(0.93, 0.085) * (1 - 0.75 * lobe) + 2.0 * lobe * bump(0.7, 0.3)
     height += 4.5 * face * np.exp(-(((b + 4) / 6.5) ** 2)) * bump(0.62, 0.2)  # tragus
     height -= 5.0 * face * smoothstep(0.72, 1.0, r)  # the front edge sinks into the cheek
-    height = np.where(behind, np.array([0] * 17 + [-1.5, -4.0, -6.5, -9.0, -12.0])[:, None] - 5 * face, height)
+    height = np.where(
+        behind, np.array([0] * 17 + [-1.5, -4.0, -6.5, -9.0, -12.0])[:, None] - 5 * face, height
+    )
     tilt = np.radians(27)
     backward = np.array([np.sin(tilt), -0.12, -np.cos(tilt)])
     outward = np.array([np.cos(tilt), 0.05, np.sin(tilt)])
     upward = np.array([0.10, 0.985, -0.14])
-    points = np.array([75.5, 3.0, -9.0]) + a[..., None] * backward + b[..., None] * upward + height[..., None] * outward
-    uv = disc_uv(np.where(behind, 0.8 + 0.2 * np.linspace(0, 1, 5)[np.maximum(np.arange(len(rho)) - 17, 0)][:, None], r * 0.8), f)
+    points = (
+        np.array([75.5, 3.0, -9.0])
+        + a[..., None] * backward
+        + b[..., None] * upward
+        + height[..., None] * outward
+    )
+    uv = square_uv(
+        np.where(
+            behind,
+            0.8 + 0.2 * np.linspace(0, 1, 5)[np.maximum(np.arange(len(rho)) - 17, 0)][:, None],
+            r * 0.8,
+        ),
+        f,
+    )
     uv[..., 0] = 1 - uv[..., 0]
     return grid_part("ear", points, uv, pole=True, ring=True, height=height, rho=r, behind=behind * 1.0)
 
 
 # By azimuth in degrees, for both sides: the hair's edge on the skin, mm.
 HAIRLINE = (
-    *((0, 85), (12, 86), (24, 87), (34, 82), (44, 70), (53, 54), (62, 40), (69, 24), (75, 7), (80, 6), (85, 28)),
+    *(
+        (0, 85),
+        (12, 86),
+        (24, 87),
+        (34, 82),
+        (44, 70),
+        (53, 54),
+        (62, 40),
+        (69, 24),
+        (75, 7),
+        (80, 6),
+        (85, 28),
+    ),
     *((95, 41), (107, 35), (116, 10), (124, -16), (140, -42), (160, -56), (180, -58)),
 )
-# By signed azimuth (positive to the person's left): how far it stands off the skull, mm. Combed from a parting on the left.
+# By signed azimuth (positive to the person's left): how far it stands off the skull, mm. Combed from a parting
+# on the left.
 THICKNESS = (
     *((-180, 8), (-140, 9), (-110, 9), (-84, 6), (-66, 8), (-45, 14), (-22, 22), (0, 21)),
     *((16, 16), (30, 10), (50, 8), (70, 5.5), (84, 5), (110, 8), (140, 9), (180, 8)),
@@ -178,29 +288,45 @@ def _hair_half(side: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarra
     points = skull + rise[..., None] * rays
     points[:, [0, -1], 0] = 0
     share = np.broadcast_to(s[:, None], turn.shape).copy()
-    fan = 0.5 * angle  # of the half: from straight down (front) to the right (back)
-    uv = np.stack([0.5 + 0.5 * share * np.sin(fan) ** 0.9, 1 - share * np.cos(fan) ** 0.9], -1)
-    return points, uv, {"lock": locks, "share": share}
+    return points, fan_uv(share, np.broadcast_to(angle, share.shape)), {"lock": locks, "share": share}
 
 
 def strands(turn: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """[R, C] in [0, 1]: locks that lean to the person's right, sharp in their partings and round on their backs."""
+    """[R, C] in [0, 1]: locks that lean to the person's right, sharp in their partings and round on their
+    backs.
+    """
     lean = angle[None] + 0.55 * turn * np.cos(0.5 * angle)[None] ** 2
     broad = np.abs(np.sin(8.5 * lean + 0.9 * np.sin(3 * turn + 2 * lean)))
     fine = np.abs(np.sin(19 * lean + 1.3 * np.sin(4 * turn - 1.5 * lean) + 0.8))
-    return (0.68 * broad**0.7 + 0.32 * fine**0.8) * smoothstep(0.02, 0.35, turn) + 0.6 * smoothstep(0.35, 0.02, turn)
+    return (0.68 * broad**0.7 + 0.32 * fine**0.8) * smoothstep(0.02, 0.35, turn) + 0.6 * smoothstep(
+        0.35, 0.02, turn
+    )
 
 
 def build_shirt() -> Part:
     """A crew-neck shirt over neck, shoulders and chest, open below."""
     theta = np.radians(np.linspace(0, 180, 41))
     # rows: half width, half depth, height in front / at the side / behind, mm
-    rings = np.array([
-        [52, 52, -154, -138, -126], [55, 55, -153, -136, -124], [57.5, 57, -154, -136, -124], [59, 58.5, -157, -139, -127],
-        [60, 60, -162, -143, -131], [63, 62, -166, -146, -134], [78, 68, -174, -152, -141], [102, 76, -185, -159, -151],
-        [130, 84, -199, -167, -162], [156, 92, -215, -176, -176], [177, 99, -233, -189, -193], [192, 105, -253, -209, -213],
-        [200, 109, -276, -234, -236], [203, 112, -300, -262, -264], [203, 114, -324, -294, -294], [201, 115, -345, -330, -330],
-    ])
+    rings = np.array(
+        [
+            [52, 52, -154, -138, -126],
+            [55, 55, -153, -136, -124],
+            [57.5, 57, -154, -136, -124],
+            [59, 58.5, -157, -139, -127],
+            [60, 60, -162, -143, -131],
+            [63, 62, -166, -146, -134],
+            [78, 68, -174, -152, -141],
+            [102, 76, -185, -159, -151],
+            [130, 84, -199, -167, -162],
+            [156, 92, -215, -176, -176],
+            [177, 99, -233, -189, -193],
+            [192, 105, -253, -209, -213],
+            [200, 109, -276, -234, -236],
+            [203, 112, -300, -262, -264],
+            [203, 114, -324, -294, -294],
+            [201, 115, -345, -330, -330],
+        ]
+    )
     wide, deep, front, side, back = rings.T[..., None]
     bend = np.cos(theta)
     height = np.where(bend > 0, side + (front - side) * bend**2, side + (back - side) * bend**2)
@@ -210,7 +336,6 @@ def build_shirt() -> Part:
     points = np.stack([x, height, z], -1)
     points[:, [0, -1], 0] = 0
     band = np.broadcast_to((np.arange(len(rings)) < 6)[:, None] * 1.0, x.shape)
-    share = np.linspace(0.25, 1, len(rings))[:, None]
-    fan = theta / 2
-    uv = np.stack([0.5 + 0.5 * share * np.sin(fan), 1 - share * np.cos(fan)], -1)
+    share = np.broadcast_to(np.linspace(0.25, 1, len(rings))[:, None], x.shape)
+    uv = fan_uv(share, np.broadcast_to(theta, x.shape))
     return grid_part("shirt", points, uv, band=band)

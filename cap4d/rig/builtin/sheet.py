@@ -1,7 +1,7 @@
 """Surfaces as grids of vertices, and how half a head of them becomes a whole mesh.
 
-Every part is modelled for x >= 0 as one or more grids over a shared list of points; `mirrored` welds on the other half.
-Grids run counter-clockwise seen from outside when, looked at, columns go right and rows go down.
+Every part is modelled for x >= 0 as one or more grids over a shared list of points; `mirrored` welds on the
+other half. Grids run counter-clockwise seen from outside when, looked at, columns go right and rows go down.
 """
 
 from __future__ import annotations
@@ -16,14 +16,18 @@ MIDLINE = 1e-6  # mm; points nearer to the mirror plane belong to both halves
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """ids int[R, C] vertices, uv [R, C, 2] in [0, 1]; `holes` are rows r whose quads to row r + 1 are left out."""
+    """ids int[R, C] vertices, uv [R, C, 2] in [0, 1]; `holes` are rows r whose quads to row r + 1 are left
+    out.
+    """
 
     ids: np.ndarray
     uv: np.ndarray
     holes: tuple[int, ...] = ()
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """[F, 3] vertex ids and [F, 3] indices into the flattened uv; triangles without area in the mesh are dropped."""
+        """[F, 3] vertex ids and [F, 3] indices into the flattened uv; triangles without area in the mesh are
+        dropped.
+        """
         rows, columns = self.ids.shape
         flat = np.arange(rows * columns).reshape(rows, columns)
         keep = np.ones(rows - 1, bool)
@@ -40,7 +44,8 @@ class Grid:
 class Part:
     """Half of a part: points [N, 3] mm with x >= 0 on or off the midline, its grids, and values per point.
 
-    `other`: the right half where it is not the left one's mirror image, also with x >= 0 and of the same grids.
+    `other`: the right half where it is not the left one's mirror image, also with x >= 0 and of the same
+    grids.
     """
 
     name: str
@@ -53,7 +58,9 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """The whole head. points [V, 3] mm; `part` int[V] index into `names`; `partner` int[V] the mirrored vertex."""
+    """The whole head. points [V, 3] mm; `part` int[V] index into `names`; `partner` int[V] the mirrored
+    vertex.
+    """
 
     points: np.ndarray
     faces: np.ndarray
@@ -94,18 +101,21 @@ def assemble(parts: list[Part], left_uv: PlaceUv, right_uv: PlaceUv) -> Mesh:
             uv_faces += [corners + uv_start, corners[:, ::-1] + uv_start + len(uv)]
             uv_start += 2 * len(uv)
         start += len(p.points)
+    uvs, welded = np.unique(np.round(np.concatenate(uvs), 7), axis=0, return_inverse=True)
+    uv_faces = welded.reshape(-1)[np.concatenate(uv_faces)]  # neighbours share UVs too: the grid goes by them
     marks = {}
     for name in sorted({m for p in parts for m in p.marks}):
         left_half, right_half = (
-            np.concatenate([p.marks.get(name, np.zeros(len(p.points))) for p in half]) for half in (parts, right_halves)
+            np.concatenate([p.marks.get(name, np.zeros(len(p.points))) for p in half])
+            for half in (parts, right_halves)
         )
         marks[name] = np.concatenate([left_half, right_half[~middle]])
     colors, right_colors = (np.concatenate([p.colors for p in half]) for half in (parts, right_halves))
     return Mesh(
         points=np.concatenate([points, right[~middle] * [-1, 1, 1]]),
         faces=np.concatenate(faces),
-        uvs=np.concatenate(uvs),
-        uv_faces=np.concatenate(uv_faces),
+        uvs=uvs,
+        uv_faces=uv_faces,
         colors=np.concatenate([colors, right_colors[~middle]]),
         names=tuple(p.name for p in parts),
         part=np.concatenate([part, part[~middle]]),
@@ -121,7 +131,9 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
 
 
 def curve(x: np.ndarray, knots: list[tuple[float, float]], *, soft: float = 5.0) -> np.ndarray:
-    """A smooth function through about `knots` (x, y): broken lines blurred by a Gaussian of `soft`, flat at both ends."""
+    """A smooth function through about `knots` (x, y): broken lines blurred by a Gaussian of `soft`, flat at
+    both ends.
+    """
     knot_x, knot_y = np.array(knots, float).T
     fine = np.arange(knot_x[0] - 4 * soft, knot_x[-1] + 4 * soft, soft / 8)
     reflected = np.where(fine < knot_x[0], 2 * knot_x[0] - fine, fine)

@@ -1,15 +1,19 @@
-"""The skin from the hidden scalp to the neck: one grid of rows and columns that opens at the eyes and at the mouth.
+"""The skin from the hidden scalp to the neck: one grid of rows and columns that opens at the eyes and at the
+mouth.
 
-Columns are half-planes of constant azimuth about the vertical axis (0 is the face's middle, 180 the back). Rows are
-lofted between landmark lines (KEYS), and two of the rows are doubled where the lids and the lips part, so that lid and
-lip rims are clean edge loops. The rows inside lids and lips, and the mouth's pouch, hang on those rims.
+Columns are half-planes of constant azimuth about the vertical axis (0 is the face's middle, 180 the back).
+Rows are lofted between landmark lines (KEYS), and two of the rows are doubled where the lids and the lips
+part, so that lid and lip rims are clean edge loops. The rows inside lids and lips, and the mouth's pouch,
+hang on those rims.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
-from cap4d.rig.builtin.field import EYE, EYE_RADIUS, LID_RADIUS, cast, head_distance, settle
+from cap4d.rig.builtin.field import EYE, EYE_RADIUS, cast, settle
 from cap4d.rig.builtin.sheet import Grid, Part, curve, smoothstep
 
 CORNER = 16.5  # deg; the inner eye corner and the mouth corner share a column
@@ -17,26 +21,34 @@ OUTER = 37.0  # deg; outer eye corner
 SPANS = ((0.0, CORNER, 17), (CORNER, OUTER, 20), (OUTER, 60.0, 12), (60.0, 120.0, 15), (120.0, 180.0, 8))
 CORNER_COLUMN, OUTER_COLUMN = 17, 37
 
-# Landmark lines: height in mm by azimuth in degrees, and the number of rows from the line above.
-BACK = ((112, 0.0), (132, -30.0), (150, -56.0), (180, -62.0))
+# Landmark lines: their name, the number of rows from the line above, and their height in mm at AZIMUTHS (deg).
+AZIMUTHS = (0, 10, 16, 25, 31, 38, 48, 60, 80, 95, 112, 132, 150, 180)
 KEYS = (
-    ("hidden", 0, ((0, 101), (30, 99), (50, 86), (65, 66), (80, 54), (95, 52), (112, 40), (132, 0), (150, -25), (180, -32))),
-    ("hair", 4, ((0, 78), (30, 76), (50, 62), (70, 45), (90, 38), (112, 26), (132, -8), (150, -36), (180, -42))),
-    ("brow_top", 7, ((0, 53), (25, 54), (38, 51), (55, 42), (75, 30), (90, 26), (112, 14), (132, -14), (150, -42), (180, -48))),
-    ("brow", 8, ((0, 42), (25, 43), (38, 40), (55, 33), (75, 26), (90, 22), (112, 10), (132, -18), (150, -46), (180, -52))),
-    ("crease", 8, ((0, 31), (16, 30), (37, 29), (48, 25), (60, 20), (80, 14), (95, 8), (112, -2), (132, -28), (150, -54), (180, -60))),
-    ("upper_lid", 7, ((0, 18.5), (16, 18.2), (37, 20), (48, 17), (62, 12), (80, 6), (95, 0), (112, -10), (132, -35), (150, -60), (180, -66))),
-    ("lower_lid", 1, ((0, 18.5), (16, 18.2), (37, 20), (48, 17), (62, 12), (80, 6), (95, 0), (112, -10), (132, -35), (150, -60), (180, -66))),
-    ("under_lid", 6, ((0, 8), (16, 8), (25, 6.5), (37, 9), (50, 6), (65, 1), (80, -5), (95, -10), (112, -19), (132, -41), (150, -65), (180, -70))),
-    ("nose", 22, ((0, -31), (30, -31), (45, -33), (60, -36), (80, -38), (95, -39), (112, -42), (132, -56), (150, -74), (180, -78))),
-    ("upper_vermilion", 7, ((0, -46), (30, -47), (45, -48), (60, -49), (80, -49), (95, -50), (112, -52), (132, -63), (150, -79), (180, -83))),
-    ("upper_lip", 7, ((0, -53.7), (10, -53.4), (16.5, -52.4), (30, -54), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
-    ("lower_lip", 1, ((0, -53.7), (10, -53.4), (16.5, -52.4), (30, -54), (45, -57), (60, -58), (80, -58), (95, -60), (112, -61), (132, -69), (150, -84), (180, -87))),
-    ("lower_vermilion", 7, ((0, -64), (30, -62.5), (45, -63), (60, -63), (80, -63), (95, -65), (112, -66), (132, -73), (150, -87), (180, -90))),
-    ("chin", 12, ((0, -86), (40, -81), (60, -74), (80, -70), (95, -70), (120, -78), (150, -97), (180, -99))),
-    ("jaw", 8, ((0, -102), (20, -100), (40, -91), (60, -81), (80, -74), (95, -74), (120, -84), (150, -107), (180, -110))),
-    ("throat", 9, ((0, -120), (40, -116), (60, -108), (95, -98), (120, -100), (150, -122), (180, -125))),
-    ("collar", 10, ((0, -195), (180, -195))),
+    ("hidden", 0, (101, 100.3, 99.9, 99.3, 98.3, 93.8, 87.3, 72.7, 54, 52, 40, 0, -25, -32)),
+    ("hair", 4, (78, 77.3, 76.9, 76.3, 75.3, 70.4, 63.4, 53.5, 41.5, 35.3, 26, -8, -36, -42)),
+    ("brow_top", 7, (53, 53.4, 53.6, 54, 52.6, 51, 45.7, 39, 28.7, 23.3, 14, -14, -42, -48)),
+    ("brow", 8, (42, 42.4, 42.6, 43, 41.6, 40, 35.9, 31.2, 24.7, 19.3, 10, -18, -46, -52)),
+    ("crease", 8, (31, 30.4, 30, 29.6, 29.3, 28.6, 25, 20, 14, 8, -2, -28, -54, -60)),
+    ("upper_lid", 7, (18.5, 18.3, 18.2, 19, 19.5, 19.7, 17, 12.7, 6, 0, -10, -35, -60, -66)),
+    ("lower_lid", 1, (18.5, 18.3, 18.2, 19, 19.5, 19.7, 17, 12.7, 6, 0, -10, -35, -60, -66)),
+    ("under_lid", 6, (8, 8, 8, 6.5, 7.8, 8.8, 6.5, 2.7, -5, -10, -19, -41, -65, -70)),
+    ("nose", 22, (-31, -31, -31, -31, -31.1, -32.1, -33.6, -36, -38, -39, -42, -56, -74, -78)),
+    (
+        "upper_vermilion",
+        7,
+        (-46, -46.3, -46.5, -46.8, -47.1, -47.5, -48.2, -49, -49, -50, -52, -63, -79, -83),
+    ),
+    ("upper_lip", 7, (-53.7, -53.4, -52.5, -53.4, -54.2, -55.6, -57.2, -58, -58, -60, -61, -69, -84, -87)),
+    ("lower_lip", 1, (-53.7, -53.4, -52.5, -53.4, -54.2, -55.6, -57.2, -58, -58, -60, -61, -69, -84, -87)),
+    ("lower_vermilion", 7, (-64, -63.5, -63.2, -62.8, -62.5, -62.8, -63, -63, -63, -65, -66, -73, -87, -90)),
+    ("chin", 12, (-86, -84.8, -84, -82.9, -82.1, -81.2, -78.2, -74, -70, -70, -75.4, -85.6, -97, -99)),
+    ("jaw", 8, (-102, -101, -100.4, -97.8, -95, -91.9, -87, -81, -74, -74, -80.8, -93.2, -107, -110)),
+    (
+        "throat",
+        9,
+        (-120, -119, -118.4, -117.5, -116.9, -116.2, -112.8, -108, -102.3, -98, -99.4, -108.8, -122, -125),
+    ),
+    ("collar", 10, (-195, -195, -195, -195, -195, -195, -195, -195, -195, -195, -195, -195, -195, -195)),
 )
 EYE_OPEN = (6.6, -5.6)  # mm the lid rims bow up and down from the line between the corners
 LIP_ROWS, LID_ROWS = 4, 3
@@ -72,17 +84,23 @@ def vermilion(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def row_heights(theta: np.ndarray) -> np.ndarray:
     """[R, C] the height of every row at every column, mm."""
-    lines = {key: curve(theta, list(knots), soft=4.0) for key, _, knots in KEYS}
+    lines = {
+        key: curve(theta, list(zip(AZIMUTHS, heights, strict=True)), soft=4.0) for key, _, heights in KEYS
+    }
     up, low = lid_bow(theta)
     lines["upper_lid"] = lines["upper_lid"] + up
     lines["lower_lid"] = lines["lower_lid"] + low
     lines["crease"] = np.maximum(lines["crease"], lines["upper_lid"] + 5.5 * smoothstep(60, 30, theta) + 1)
     red_up, red_low = vermilion(np.clip(theta / CORNER, 0, 1))
     inside = smoothstep(CORNER + 9, CORNER - 3, theta)
-    lines["upper_vermilion"] = (1 - inside) * lines["upper_vermilion"] + inside * (lines["upper_lip"] + np.maximum(red_up, 1.4))
-    lines["lower_vermilion"] = (1 - inside) * lines["lower_vermilion"] + inside * (lines["lower_lip"] - np.maximum(red_low, 1.4))
+    lines["upper_vermilion"] = (1 - inside) * lines["upper_vermilion"] + inside * (
+        lines["upper_lip"] + np.maximum(red_up, 1.4)
+    )
+    lines["lower_vermilion"] = (1 - inside) * lines["lower_vermilion"] + inside * (
+        lines["lower_lip"] - np.maximum(red_low, 1.4)
+    )
     rows = [lines[KEYS[0][0]][None]]
-    for (above, _, _), (below, n, _) in zip(KEYS[:-1], KEYS[1:], strict=True):
+    for (above, _, _), (below, n, _) in pairwise(KEYS):
         t = np.arange(1, n + 1)[:, None] / n
         rows.append((1 - t) * lines[above] + t * lines[below])
     return np.concatenate(rows)
@@ -144,13 +162,23 @@ def lip_relief(points: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """[R, C, 3] the main grid with lips, philtrum and mouth corners raised from the bare head."""
     points = points.copy()
     rows = np.arange(len(points))[:, None]
-    top, upper, lower, bottom = (row_of(k) for k in ("upper_vermilion", "upper_lip", "lower_lip", "lower_vermilion"))
+    top, upper, lower, bottom = (
+        row_of(k) for k in ("upper_vermilion", "upper_lip", "lower_lip", "lower_vermilion")
+    )
     u = theta / CORNER
     taper = np.maximum(1 - np.minimum(u, 1) ** 2.2, 0) ** 0.85
     t_up = np.clip((rows - top) / (upper - top), -2, 1)
     t_low = np.clip((bottom - rows) / (bottom - lower), -2, 1)
-    upper_lip = np.where(t_up >= 0, 1.2 + 4.0 * np.sin(np.pi * 0.62 * np.maximum(t_up, 0)) - 2.9 * np.maximum(t_up, 0) ** 4, 1.2 * smoothstep(-1.3, 0, t_up))
-    lower_lip = np.where(t_low >= 0, 0.5 + 5.9 * np.sin(np.pi * 0.66 * np.maximum(t_low, 0)) - 3.5 * np.maximum(t_low, 0) ** 4, 0.5 * smoothstep(-0.8, 0, t_low))
+    upper_lip = np.where(
+        t_up >= 0,
+        1.2 + 4.0 * np.sin(np.pi * 0.62 * np.maximum(t_up, 0)) - 2.9 * np.maximum(t_up, 0) ** 4,
+        1.2 * smoothstep(-1.3, 0, t_up),
+    )
+    lower_lip = np.where(
+        t_low >= 0,
+        0.5 + 5.9 * np.sin(np.pi * 0.66 * np.maximum(t_low, 0)) - 3.5 * np.maximum(t_low, 0) ** 4,
+        0.5 * smoothstep(-0.8, 0, t_low),
+    )
     push = taper * np.where(rows <= upper, upper_lip, lower_lip)
     y, line = points[..., 1], points[upper, :, 1]
     corner = np.exp(-(((theta - CORNER) / 3.0) ** 2) - ((y - line) / 5.0) ** 2)
@@ -161,7 +189,9 @@ def lip_relief(points: np.ndarray, theta: np.ndarray) -> np.ndarray:
     push = push + between * (0.55 * np.exp(-(((x - 5.4) / 2.8) ** 2)) - 0.8 * np.exp(-((x / 3.4) ** 2)))
     fold = rows - row_of("upper_lid") + 0.0 * theta  # the crease over the upper lid
     over_eye = smoothstep(CORNER, CORNER + 5, theta) * smoothstep(OUTER + 4, OUTER - 4, theta)
-    push = push + over_eye * (0.9 * np.exp(-(((fold + 9.5) / 2.0) ** 2)) - 1.3 * np.exp(-(((fold + 6.8) / 1.1) ** 2)))
+    push = push + over_eye * (
+        0.9 * np.exp(-(((fold + 9.5) / 2.0) ** 2)) - 1.3 * np.exp(-(((fold + 6.8) / 1.1) ** 2))
+    )
     angle = np.radians(0.6 * theta)
     points += push[..., None] * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
     points[:, 0, 0] = 0
@@ -169,7 +199,9 @@ def lip_relief(points: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def inside_lids(rim: np.ndarray, sign: float) -> np.ndarray:
-    """[LID_ROWS, K, 3] rows behind a lid's rim [K, 3]: over the rim's edge, then away between lid and eyeball."""
+    """[LID_ROWS, K, 3] rows behind a lid's rim [K, 3]: over the rim's edge, then away between lid and
+    eyeball.
+    """
     arm = rim - EYE
     u = np.linspace(0, 1, len(rim))
     open_ = np.sin(np.pi * u) ** 0.5
@@ -187,11 +219,15 @@ def inside_lids(rim: np.ndarray, sign: float) -> np.ndarray:
 
 
 def inside_lips(rim: np.ndarray, sign: float) -> np.ndarray:
-    """[LIP_ROWS, K, 3] rows behind a lip's rim [K, 3], middle to corner: back over the teeth, then up or down."""
+    """[LIP_ROWS, K, 3] rows behind a lip's rim [K, 3], middle to corner: back over the teeth, then up or
+    down.
+    """
     u = np.linspace(0, 1, len(rim))
     taper = np.maximum(1 - u**3, 0) ** 0.6
     back = np.array([2.0, 4.5, 6.5, 7.5])[:, None] * (0.55 + 0.45 * taper)
-    lift = np.array([-0.35, 0.5, 4.0, 9.0])[:, None] * taper  # first past each other, so that closed lips show no slit
+    lift = (
+        np.array([-0.35, 0.5, 4.0, 9.0])[:, None] * taper
+    )  # first past each other, so that closed lips show no slit
     rows = np.repeat(rim[None], LIP_ROWS, 0)
     rows[..., 2] -= back
     rows[..., 1] += sign * lift
@@ -200,7 +236,9 @@ def inside_lips(rim: np.ndarray, sign: float) -> np.ndarray:
 
 
 def pouch(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
-    """[Q, K, 3] the mouth's lining from behind the upper lip over the palate to the back and under the tongue."""
+    """[Q, K, 3] the mouth's lining from behind the upper lip over the palate to the back and under the
+    tongue.
+    """
     t = np.linspace(0, 1, 13)[:, None, None]
     middle = 0.5 * (upper + lower) - [0, 1.0, 0]
     half = 0.5 * (upper - lower)
@@ -214,21 +252,30 @@ def pouch(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
     return rows
 
 
-# Heights in the UV atlas of the bands between landmark lines, and of the openings, in parts of the island.
-BANDS = (0, 3, 5, 5, 4, 5, 0, 4, 11, 4.5, 5, 0, 5, 7, 5, 6, 7)
-EYE_HOLE, MOUTH_HOLE = 8.0, 8.5
+# Heights in the UV atlas of the bands between landmark lines and of the openings, in pixels of the 128-pixel
+# grid. The
+# rims of lids and lips lie on pixel centres (from the top: 22.5, 29.5, 54.5, 61.5), so that the grid has them
+# as edges.
+BANDS = (0, 3.5, 5, 5, 4, 5, 0, 4, 11.5, 4.5, 5, 0, 5, 7, 4.5, 4.5, 4.5)
+EYE_HOLE, MOUTH_HOLE = 7.0, 7.0
+INSIDE_LID, INSIDE_LIP = (
+    (0, 1.0, 1.5, 2.01),
+    (0, 0.7, 1.2, 1.7, 2.01),
+)  # pixels from the rim of the rows behind it
+SKIN_HEIGHT = sum(BANDS) + EYE_HOLE + MOUTH_HOLE
 
 
 def skin_uv(theta: np.ndarray) -> np.ndarray:
-    """[R, C, 2] in [0.5, 1] x [0, 1]: rows and columns with the openings drawn apart, so that no cell bridges them."""
+    """[R, C, 2] in [0.5, 1] x [0, 1]: rows and columns with the openings drawn apart, so that no cell bridges
+    them.
+    """
     weight = np.where(np.arange(len(theta) - 1) < OUTER_COLUMN + 12, 1.0, 0.8)
     u = np.concatenate([[0], np.cumsum(weight)])
     u = 0.5 + 0.5 * u / u[-1]
-    total = sum(BANDS) + EYE_HOLE + MOUTH_HOLE
     column = np.arange(len(theta))
     e = np.clip((column - CORNER_COLUMN) / (OUTER_COLUMN - CORNER_COLUMN), 0, 1)
-    eye = EYE_HOLE / 2 * np.sin(np.pi * e) ** 0.5
-    mouth = MOUTH_HOLE / 2 * np.maximum(1 - (column / CORNER_COLUMN) ** 4, 0) ** 0.5
+    eye = EYE_HOLE / 2 * np.clip(7 * np.minimum(e, 1 - e), 0, 1) ** 0.7
+    mouth = MOUTH_HOLE / 2 * np.clip(6 * (1 - column / CORNER_COLUMN), 0, 1) ** 0.7
     lines, depth = [], 0.0
     for (key, _, _), band in zip(KEYS, BANDS, strict=True):
         depth += band + {"lower_lid": EYE_HOLE, "lower_lip": MOUTH_HOLE}.get(key, 0)
@@ -240,12 +287,13 @@ def skin_uv(theta: np.ndarray) -> np.ndarray:
     for k in range(1, len(KEYS)):
         t = np.arange(1, KEYS[k][1] + 1)[:, None] / KEYS[k][1]
         rows.append((1 - t) * lines[k - 1] + t * lines[k])
-    v = 1 - np.concatenate(rows) / total
+    v = 1 - np.concatenate(rows) / SKIN_HEIGHT
     return np.stack([np.broadcast_to(u, v.shape), v], -1)
 
 
 def build_skin() -> tuple[Part, Part]:
-    """The skin with the insides of lids and lips, and the mouth's pouch, which shares its first and last row's places.
+    """The skin with the insides of lids and lips, and the mouth's pouch, which shares its first and last
+    row's places.
 
     Marks of the skin: `row` and `column` of the main grid (rows inside lids and lips carry their rim's row),
     `depth` 0 on the outside, 1.. for rows behind a rim.
@@ -262,7 +310,10 @@ def build_skin() -> tuple[Part, Part]:
         shared = np.setdiff1d(np.arange(columns), inner)
         ids[below, shared] = ids[above, shared]
         points[below, shared] = points[above, shared]
-    cloud, marks = [points.reshape(-1, 3)], [np.stack([*np.indices((rows, columns)), np.zeros((rows, columns), int)], -1).reshape(-1, 3)]
+    cloud, marks = (
+        [points.reshape(-1, 3)],
+        [np.stack([*np.indices((rows, columns)), np.zeros((rows, columns), int)], -1).reshape(-1, 3)],
+    )
     grids = [Grid(ids, uv, (eye[0], lips[0]))]
     count = rows * columns
     strips = {}
@@ -277,7 +328,9 @@ def build_skin() -> tuple[Part, Part]:
         strip_ids = count + np.arange(n * len(cols)).reshape(n, len(cols))
         count += strip_ids.size
         cloud.append(strip.reshape(-1, 3))
-        marks.append(np.stack(np.broadcast_arrays(row, cols, np.arange(1, n + 1)[:, None]), -1).reshape(-1, 3))
+        marks.append(
+            np.stack(np.broadcast_arrays(row, cols, np.arange(1, n + 1)[:, None]), -1).reshape(-1, 3)
+        )
         ends = (0, -1) if "lid" in name else (-1,)
         if sign < 0:
             for end in ends:
@@ -285,7 +338,8 @@ def build_skin() -> tuple[Part, Part]:
         full = np.concatenate([ids[row, cols][None], strip_ids])
         strips[name] = full
         toward = (uv[eye if "lid" in name else lips, :][:, cols]).mean(0)
-        share = 0.32 * np.arange(n + 1)[:, None, None] / n
+        steps, hole = (INSIDE_LID, EYE_HOLE) if "lid" in name else (INSIDE_LIP, MOUTH_HOLE)
+        share = np.array(steps)[:, None, None] / (hole / 2)
         strip_uv = (1 - share) * uv[row, cols] + share * toward
         grids.append(Grid(full if sign > 0 else full[::-1], strip_uv if sign > 0 else strip_uv[::-1]))
     cloud, marks = np.concatenate(cloud), np.concatenate(marks)
@@ -300,8 +354,13 @@ def build_skin() -> tuple[Part, Part]:
 
 
 def pouch_part(lining: np.ndarray) -> Part:
+    """The pouch as a part; at the corner its upper and lower wall are one. Marks: `row` 0 to 1, `column`."""
     rows, columns = lining.shape[:2]
     ids = np.arange(rows * columns).reshape(rows, columns)
+    ids[(rows + 1) // 2 :, -1] = ids[: rows // 2, -1][::-1]
+    used, new = np.unique(ids, return_inverse=True)
     u, v = np.meshgrid(np.linspace(0.5, 1, columns), np.linspace(1, 0, rows))
     marks = {"row": np.repeat(np.linspace(0, 1, rows), columns), "column": np.tile(np.arange(columns), rows)}
-    return Part("mouth", lining.reshape(-1, 3), (Grid(ids, np.stack([u, v], -1)),), np.zeros((ids.size, 3)), marks)
+    grid = Grid(new.reshape(ids.shape), np.stack([u, v], -1))
+    marks = {name: mark[used] for name, mark in marks.items()}
+    return Part("mouth", lining.reshape(-1, 3)[used], (grid,), np.zeros((len(used), 3)), marks)
