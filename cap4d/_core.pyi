@@ -1,4 +1,4 @@
-"""The C++ extension. Arrays must have the dtype named here and be C-contiguous: nothing is converted silently."""
+"""The C++ extension. Arrays must have the dtype named here and be C-contiguous: nothing is converted."""
 
 from typing import Literal, final
 
@@ -10,17 +10,35 @@ _F64 = NDArray[np.float64]
 _I32 = NDArray[np.int32]
 
 def rasterize_mesh(
-    xyz: _F64, faces: _I32, height: int, width: int, cull: Literal["none", "clockwise", "counter_clockwise"] = "none"
+    xyz: _F64,
+    faces: _I32,
+    height: int,
+    width: int,
+    cull: Literal["none", "clockwise", "counter_clockwise"] = "none",
 ) -> tuple[_I32, _F64]:
     """xyz [V, 3] px, px, depth -> triangle per pixel [H, W] (-1: none) and its barycentrics [H, W, 3]."""
 
 def sort_by_depth(means: _F32, viewmat: _F32, threads: int = 0) -> NDArray[np.uint32]:
-    """Order [N] of means [N, 3] near to far along the axis of viewmat [4, 4]; stable. Non-finite depths come last."""
+    """Order [N] of means [N, 3] near to far along the axis of viewmat [4, 4]; stable. Non-finite come last."""
 
 def bind(
     vertices: _F32, faces: _I32, means: _F32, quats: _F32, log_scales: _F32, binding: _I32, threads: int = 0
 ) -> tuple[_F32, _F32, _F32]:
-    """vertices [G, 3], faces [M, 3], local Gaussians [N, ...] -> posed means [N, 3], quats [N, 4], scales [N, 3]."""
+    """vertices [G, 3], faces [M, 3], local Gaussians -> posed means [N, 3], quats [N, 4], scales [N, 3]."""
+
+def bind_vjp(
+    vertices: _F32,
+    faces: _I32,
+    means: _F32,
+    quats: _F32,
+    log_scales: _F32,
+    binding: _I32,
+    v_means: _F32,
+    v_quats: _F32,
+    v_scales: _F32,
+    threads: int = 0,
+) -> tuple[_F32, _F32, _F32, _F32]:
+    """Gradients of `bind`'s outputs -> those of vertices [G, 3], means, quats, log_scales [N, ...]."""
 
 def render(
     means: _F32,
@@ -81,7 +99,7 @@ def rasterize_vjp(
     v_depth: _F32 | None,
     threads: int = 0,
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
-    """Gradients of means, quats, scales, opacities, sh and means2d, from the inputs, outputs and output gradients of `rasterize`."""
+    """Gradients of means, quats, scales, opacities, sh and means2d, given all that went into and out of `rasterize`."""
 
 def isa() -> Literal["base", "v3", "v4"]:
     """The x86-64 level of the inner loops in use (CAP4D_ISA asks for a lower one)."""

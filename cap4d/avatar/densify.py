@@ -162,7 +162,9 @@ def _last_of_their_face(doomed: torch.Tensor, model: AvatarModel, faces: int) ->
     at_risk = (doomed & (survivors[model.binding] == 0)).nonzero()[:, 0]
     opacity = model.gaussians["opacity_logits"].detach()[at_risk]
     order = at_risk[torch.sort(opacity, stable=True).indices]
-    rank = torch.full((faces,), -1).scatter_reduce(0, model.binding[order], torch.arange(len(order)), "amax")
+    rank = torch.full((faces,), -1).scatter_reduce(
+        0, model.binding[order].long(), torch.arange(len(order)), "amax"
+    )
     saved = torch.zeros_like(doomed)
     saved[order[rank[rank >= 0]]] = True
     return saved

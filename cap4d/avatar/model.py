@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from cap4d.avatar.bound import bind_to
 from cap4d.avatar.deformer import Deformer
-from cap4d.bind import bind, triangle_frames
 from cap4d.camera import opencv_from_rig
 from cap4d.drive.clip import Frame
 from cap4d.rig.grid import UvGrid, remesh
@@ -57,17 +57,14 @@ class Posed:
     """The avatar at one moment, in the head-fixed frame.
 
     Args:
-        vertices: [G, 3] m.
-        rotmats: [M, 3, 3] triangle frames, and `neutral_rotmats` those without the expression's deformation.
-        deformation: None without a network.
+        surface: [G, 3] m, the rig alone, before any rigid correction.
+        deformation: What the network adds to it; None without a network.
         means, quats, scales: [N, ...] Gaussians, m.
         opacities: [N].
         sh: [N, S, 3].
     """
 
-    vertices: torch.Tensor
-    rotmats: torch.Tensor
-    neutral_rotmats: torch.Tensor | None
+    surface: torch.Tensor
     deformation: Deformation | None
     means: torch.Tensor
     quats: torch.Tensor
@@ -83,7 +80,7 @@ class AvatarModel(nn.Module):
         subject: The shape-baked rig on the G grid vertices, NumPy.
         grid: The rig's UV grid.
         gaussians: Local Gaussians, raw: the tensors of `GAUSSIAN_FIELDS`, N rows each.
-        binding: int64[N] the triangle each sits on.
+        binding: int32[N] the triangle each sits on.
         deformer: None: nothing but the rig moves the surface.
     """
 
@@ -101,7 +98,7 @@ class AvatarModel(nn.Module):
         self.deformer = deformer
         self.gaussians = nn.ParameterDict({name: nn.Parameter(gaussians[name]) for name in GAUSSIAN_FIELDS})
         self.register_buffer("binding", binding)
-        self.register_buffer("faces", torch.from_numpy(grid.faces).long(), persistent=False)
+        self.register_buffer("faces", torch.from_numpy(grid.faces), persistent=False)
         self.register_buffer("deformable", torch.from_numpy(grid.deformable)[:, None], persistent=False)
 
     def __len__(self) -> int:
@@ -110,10 +107,10 @@ class AvatarModel(nn.Module):
 
     def offsets(self, pose: Pose) -> torch.Tensor:
         """[3, S, S] m: what expression and eyes move, with the jaw's own turn in both terms and no neck (fact 20)."""
-        expr, jaw_rot = pose.expr.detach(), pose.jaw_rot.detach()
-        posed = self.subject.pose(expr, eye_rot=pose.eye_rot.detach(), jaw_rot=jaw_rot)
-        neutral = self.subject.pose(torch.zeros_like(expr), jaw_rot=jaw_rot)
-        return self.grid.to_map(opencv_from_rig(posed - neutral))
+        with torch.no_grad():
+            posed = self.subject.pose(pose.expr, eye_rot=pose.eye_rot, jaw_rot=pose.jaw_rot)
+            neutral = self.subject.pose(torch.zeros_like(pose.expr), jaw_rot=pose.jaw_rot)
+            return self.grid.to_map(opencv_from_rig(posed - neutral))
 
     def deform(self, offsets: torch.Tensor) -> Deformation:
         """Both passes of the network as one batch (fact 24). The model must have a network."""
@@ -138,19 +135,17 @@ class AvatarModel(nn.Module):
         vertices = surface if deformation is None else surface + deformation.moved
         if rigid is not None:
             vertices = vertices @ rigid[0].T + rigid[1]
-        frames = triangle_frames(vertices, self.faces)
         local = self.gaussians
-        means, quats, scales = bind(
-            frames,
+        means, quats, scales = bind_to(
+            vertices,
+            self.faces,
             means=local["means"],
             quats=local["quats"],
             log_scales=local["log_scales"],
             binding=self.binding,
         )
         return Posed(
-            vertices,
-            frames[1],
-            None if deformation is None else triangle_frames(surface + deformation.neutral, self.faces)[1],
+            surface,
             deformation,
             means,
             quats,
@@ -181,7 +176,7 @@ def initial_gaussians(
     """Fact 29: means in [0, 0.4)^3, scale 1 / count of the face, opacity 0.1, grey.
 
     Returns:
-        The raw local Gaussians and their binding int64[N], in the order of the faces.
+        The raw local Gaussians and their binding int32[N], in the order of the faces.
     """
     binding = torch.repeat_interleave(torch.arange(len(counts)), torch.from_numpy(counts))
     n = len(binding)
@@ -196,7 +191,7 @@ def initial_gaussians(
         "sh_dc": torch.rand(n, 1, 3, generator=generator) / 255,
         "sh_rest": torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
     }
-    return gaussians, binding
+    return gaussians, binding.int()
 
 
 def create_avatar(

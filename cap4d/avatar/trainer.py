@@ -30,6 +30,7 @@ from cap4d.bind import triangle_frames
 from cap4d.camera import opencv_from_rig
 from cap4d.raster import Rasterized, rasterize
 
+ROTATION_EVERY = 4  # steps: the term is slow and smooth, so it comes in now and then with as much more weight
 WHITE = (1.0, 1.0, 1.0)
 ADAM_EPS = 1e-15  # fact 36; gradients of a mean over pixels are tiny
 
@@ -61,7 +62,8 @@ class Trainer:
         self.optimizer = _optimizer(model, self.corrections, preset)
         self.rows = Rows(model, self.optimizer)
         neutral = opencv_from_rig(model.subject.neutral)
-        self.face_sizes = triangle_frames(neutral, model.faces)[2]
+        self.faces = model.faces.long()
+        self.face_sizes = triangle_frames(neutral, self.faces)[2]
 
     def advance(self) -> float:
         """Takes one step and returns its loss."""
@@ -112,7 +114,10 @@ class Trainer:
             return loss
         loss = loss + w.laplacian * laplacian_loss(d.maps)
         loss = loss + w.deformation * relative_deformation_loss(d.moved, d.neutral)
-        return loss + w.rotation * relative_rotation_loss(posed.rotmats, posed.neutral_rotmats)
+        if self.step % ROTATION_EVERY:
+            return loss
+        turned, neutral = (triangle_frames(posed.surface + x, self.faces)[1] for x in (d.moved, d.neutral))
+        return loss + ROTATION_EVERY * w.rotation * relative_rotation_loss(turned, neutral)
 
     def _refine(self) -> None:
         d = self.preset.densify
