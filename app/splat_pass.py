@@ -14,7 +14,8 @@ import moderngl
 import numpy as np
 
 from cap4d.app.shader_source import Constant, build_program
-from cap4d.camera import Camera
+from cap4d.bind import SAFE_NORM2
+from cap4d.camera import NEAR, Camera
 
 VERTEX_TEXTURE_WIDTH = 256  # texels; 65536 vertices make it square
 PROJECTED_BYTES = 13 * 4  # mean2d 2, conic 3, colour and opacity 4, axes 4
@@ -145,15 +146,15 @@ class SplatPass:
 
 
 def render_constants() -> dict[str, Constant]:
-    """The constants that decide a pixel; the C++ renderer's, which holds them with their reasons."""
+    """What decides a pixel: names and values of src/cpp/constants.h, which gives the reasons."""
     return {
-        "NEAR": 0.01,
+        "NEAR": NEAR,
         "LOW_PASS": 0.3,
         "JACOBIAN_MARGIN": 0.3,
         "ALPHA_MIN": 1 / 255,
         "ALPHA_MAX": 0.99,
-        "SAFE_NORM2": 1e-20,
-        "QUAT_MIN": 1e-30,
+        "SAFE_NORM2": SAFE_NORM2,
+        "QUAT_MIN": 1e-12,
     }
 
 

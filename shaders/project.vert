@@ -6,7 +6,6 @@
 #include "lib/spherical_harmonics.glsl"
 
 const float ROUNDING = 0.01;   // px
-const float QUAT_NORM_MIN = 1e-10;
 const float INFINITE = 1e30;   // a determinant that is no number is not smaller
 
 uniform sampler2D grid_vertices;  // vertex i at texel (i % width, i / width), m
@@ -50,7 +49,7 @@ void main() {
     TriangleFrame frame = triangle_frame(grid_vertex(triangle.x), grid_vertex(triangle.y), grid_vertex(triangle.z));
     vec3 mean = frame.rotation * mean_opacity.xyz * frame.size + frame.centre;
     vec3 view = (viewmat * vec4(mean, 1.0)).xyz;
-    vec4 local = quat / max(length(quat), QUAT_NORM_MIN);
+    vec4 local = quat / sqrt(max(dot(quat, quat), SAFE_NORM2));
     mat3 rotation = mat3(viewmat) * quat_to_rotmat(quat_product(normalize(rotmat_to_quat(frame.rotation)), local));
     vec3 scale = exp(log_scale) * frame.size;
     mat3 principal = mat3(rotation[0] * scale.x, rotation[1] * scale.y, rotation[2] * scale.z);

@@ -1,6 +1,7 @@
 """OpenGL draws what the CPU renderer draws, on every software driver of Mesa."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from gl_scenes import NO_DRIVER, avatar_views, scenes
 from tiny_bundle import tiny_bundle
 
+from cap4d.app.splat_pass import render_constants
 from cap4d.player.avatar import Avatar
 
 DRIVERS = {
@@ -44,6 +46,14 @@ def pictures(
     if request.param not in str(found["driver"]):
         pytest.skip(f"{request.param} is not installed: got {found['driver']}")
     return found
+
+
+def test_the_shaders_constants_are_those_of_the_cpu_renderer():
+    header = (Path(__file__).parents[2] / "src/cpp/constants.h").read_text()
+    for name, value in render_constants().items():
+        camel = "k" + name.title().replace("_", "")
+        numerator, denominator = re.search(rf" {camel} = ([\d.e-]+)f?(?: / ([\d.e-]+)f?)?;", header).groups()
+        assert np.float32(value) == np.float32(numerator) / np.float32(denominator or 1), name
 
 
 def on_white(picture: np.ndarray) -> np.ndarray:
