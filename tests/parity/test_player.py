@@ -13,11 +13,17 @@ from cap4d.bundle import Bundle, read_bundle, write_bundle
 from cap4d.gaussians import Gaussians
 from cap4d.player.avatar import Avatar
 from cap4d.render import render
+from tolerances import (
+    PLAYER_HALF_DB,
+    PLAYER_MEANS,
+    PLAYER_NEUTRAL,
+    PLAYER_PICTURE,
+    PLAYER_QUATS,
+    PLAYER_SCALES,
+    PLAYER_VERTICES,
+)
 
 from tiny_bundle import tiny_bundle
-
-# Against float64: metres, metres, unit quaternions, relative, 8-bit steps.
-TOLERANCE = {"vertices": 5e-7, "means": 1e-6, "quats": 2e-5, "scales": 1e-5, "picture": 1}
 
 FLIP = np.array([1.0, -1.0, -1.0])
 CASES = {
@@ -139,18 +145,18 @@ def test_vertices_and_gaussians(case: str, bundle: Bundle) -> None:
     pose = {k: np.array(v, np.float64) for k, v in CASES[case].items()}
     expr = pose.pop("expr", np.zeros(bundle.n_expressions))
     avatar, expected = Avatar(bundle), vertices(bundle, expr, **pose)
-    np.testing.assert_allclose(avatar.vertices(expr, **pose), expected, rtol=0, atol=TOLERANCE["vertices"])
+    np.testing.assert_allclose(avatar.vertices(expr, **pose), expected, rtol=0, atol=PLAYER_VERTICES)
     found, (means, quats, scales) = avatar.pose(expr, **pose), bound(bundle, expected)
-    np.testing.assert_allclose(found.means, means, rtol=0, atol=TOLERANCE["means"])
-    np.testing.assert_allclose(found.scales, scales, rtol=TOLERANCE["scales"])
+    np.testing.assert_allclose(found.means, means, rtol=0, atol=PLAYER_MEANS)
+    np.testing.assert_allclose(found.scales, scales, rtol=PLAYER_SCALES)
     alike = np.abs((found.quats * quats).sum(1))  # q and -q are one rotation
-    np.testing.assert_allclose(alike, 1, rtol=0, atol=TOLERANCE["quats"])
+    np.testing.assert_allclose(alike, 1, rtol=0, atol=PLAYER_QUATS)
 
 
 def test_the_baked_neutral_correction_is_the_network_at_rest(bundle: Bundle) -> None:
     rows, columns = bundle.grid.pixels.T.astype(int)
     expected = network(bundle, np.zeros((3, bundle.grid.size, bundle.grid.size)))[:, rows, columns].T
-    np.testing.assert_allclose(bundle.deform_neutral, expected, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(bundle.deform_neutral, expected, rtol=0, atol=PLAYER_NEUTRAL)
 
 
 def test_the_picture_is_that_of_the_plainly_posed_gaussians(bundle: Bundle) -> None:
@@ -162,7 +168,7 @@ def test_the_picture_is_that_of_the_plainly_posed_gaussians(bundle: Bundle) -> N
     found = Avatar(bundle).render(expr, background=(1, 1, 1), **pose)[..., :3].astype(float)
     difference = np.abs(found - 255 * np.clip(plain.rgb, 0, 1))
     # A cut-off that flips where two roundings disagree moves a pixel by more: at most one in a thousand.
-    assert np.quantile(difference, 0.999) <= TOLERANCE["picture"]
+    assert np.quantile(difference, 0.999) <= PLAYER_PICTURE
     assert found.std() > 20
 
 
@@ -172,4 +178,4 @@ def test_a_float16_bundle_plays_alike(bundle: Bundle, tmp_path: Path) -> None:
     expr = np.float32(CASES["everything"]["expr"])
     pictures = [a.render(expr, background=(1, 1, 1))[..., :3].astype(float) for a in (half, full)]
     mse = np.mean((pictures[0] - pictures[1]) ** 2)
-    assert 0 < mse < 255**2 / 10**4.5  # 45 dB
+    assert 0 < mse < 255**2 / 10 ** (PLAYER_HALF_DB / 10)
