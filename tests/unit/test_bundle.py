@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
-from cap4d.bundle import Bundle, describe, read_bundle, read_manifest, write_bundle
+from cap4d.bundle import Bundle, describe, read_bundle, read_manifest, schema, write_bundle
 from cap4d.bundle.onnx_scan import scan_onnx
 from cap4d.bundle.schema import GAUSSIANS, GRID, IDLE, RIG, TENSORS, stored_dtype, stored_shape
 from cap4d.bundle.writer import SUBJECT_ARRAYS, bundle_counts
@@ -273,3 +273,10 @@ def test_the_scanner_counts_what_it_sees(bundle: Bundle) -> None:
 def test_subject_arrays_are_all_of_them() -> None:
     named = {f.name for f in fields(Subject)} - {"rig_name", "expression_names", "joint_drivers"}
     assert set(SUBJECT_ARRAYS) == named == set(TENSORS[RIG])
+
+
+def test_the_specification_names_everything_the_schema_does() -> None:
+    text = (Path(schema.__file__).parent / "FORMAT.md").read_text()
+    names = [*schema.COUNTS, *schema.ENTRIES, *(name for specs in TENSORS.values() for name in specs)]
+    assert not [name for name in names if f"`{name}`" not in text]
+    assert f"version {schema.VERSION}" in text
