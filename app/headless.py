@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 
 import numpy as np
-
 from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
 from cap4d.app.options import Options
 from cap4d.camera import Camera

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 
 import glfw  # noqa: F401  before imgui_bundle, which otherwise loads its own, X11-only GLFW
 import moderngl
-from imgui_bundle import imgui
-
 from cap4d.app.shader_source import build_program
+from imgui_bundle import imgui
 
 MARGIN = 10  # window units
 PANEL = (

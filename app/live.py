@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-
 from cap4d.app.controls import Controls
 from cap4d.app.gl_context import is_software
 from cap4d.app.hud import Hud

@@ -6,7 +6,6 @@ from typing import Protocol
 
 import moderngl
 import numpy as np
-
 from cap4d import _core
 from cap4d.app.shader_source import build_program
 from cap4d.app.splat_pass import BoundGaussians, SplatPass

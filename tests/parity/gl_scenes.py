@@ -9,14 +9,14 @@ import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tiny_bundle import tiny_bundle
-
 from cap4d import _core
 from cap4d.bind import bind_fast
 from cap4d.camera import Camera, orbit_camera
 from cap4d.gaussians import Gaussians
 from cap4d.player.avatar import Avatar
 from cap4d.render import render
+
+from tiny_bundle import tiny_bundle
 
 NO_DRIVER = 77  # exit code
 

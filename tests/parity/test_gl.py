@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gl_scenes import NO_DRIVER, avatar_views, scenes
-from tiny_bundle import tiny_bundle
-
 from cap4d.app.splat_pass import render_constants
 from cap4d.player.avatar import Avatar
+from gl_scenes import NO_DRIVER, avatar_views, scenes
+
+from tiny_bundle import tiny_bundle
 
 DRIVERS = {
     "llvmpipe": {"LIBGL_ALWAYS_SOFTWARE": "1", "GALLIUM_DRIVER": "llvmpipe"},

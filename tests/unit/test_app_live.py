@@ -9,8 +9,6 @@ from pathlib import Path
 import glfw
 import numpy as np
 import pytest
-from tiny_bundle import tiny_bundle
-
 from cap4d.app.controls import Controls, Drag
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.live import LivePlayer, ReadOut, choose_renderer
@@ -21,6 +19,8 @@ from cap4d.bundle import write_bundle
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import camera_path
 from cap4d.player.offline import head_centre
+
+from tiny_bundle import tiny_bundle
 
 HERE = Path(__file__).resolve().parent
 

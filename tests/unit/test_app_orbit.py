@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from cap4d.app.orbit import DISTANCE_RANGE, MAX_PITCH_DEG, Orbit
 from cap4d.camera import orbit_camera
 
