@@ -70,6 +70,8 @@ def _lines(path: Path) -> list[bytes]:
 def _numbers(path: Path, keyword: str, lines: list[bytes], count: int) -> np.ndarray:
     start = keyword.encode() + b" "
     rows = [line.split(None, count + 1)[1 : count + 1] for line in lines if line.startswith(start)]
+    if not rows:
+        raise DataError(path, keyword, expected=f"{count} numbers a line", found="no such line")
     try:
         values = np.array(rows, dtype=np.bytes_).astype(np.float64)
     except ValueError as error:
