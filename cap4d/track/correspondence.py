@@ -17,7 +17,7 @@ from cap4d.mesh import rasterize_mesh, shade, vertex_normals
 from cap4d.rig.head import HeadRig
 from cap4d.track.landmarks import IRIS, N_LANDMARKS, Detector
 
-SIZE = 640  # px of the renders
+SIZE = 512  # px of the renders
 VIEWS = ((0.0, 0.0), (0.0, 12.0), (0.0, -12.0), (-22.0, 0.0), (22.0, 0.0))  # yaw, pitch in degrees
 SEARCH = 14  # px around a landmark in which its surface may begin (a lid just above the eyeball)
 AGREEMENT = 0.008  # m; views that disagree more with the median place are left out
@@ -103,7 +103,7 @@ def _sightings(rig: HeadRig, detector: Detector, vertices: np.ndarray) -> list[_
     seen = []
     for yaw, pitch in VIEWS:
         camera = _portrait(rig, world, yaw, pitch)
-        rgba = shade(world, rig.faces, camera, colors=colors, supersample=2)
+        rgba = shade(world, rig.faces, camera, colors=colors, supersample=1)
         picture = np.uint8(255 * (rgba[..., :3] * rgba[..., 3:] + 0.55 * (1 - rgba[..., 3:])))
         landmarks = detector.landmarks(picture)
         if landmarks is not None:

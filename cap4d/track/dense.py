@@ -19,18 +19,33 @@ from cap4d.camera import Camera, head_fixed, opencv_from_rig
 from cap4d.mesh import rasterize_mesh
 from cap4d.rig.head import HeadRig
 from cap4d.track.correspondence import skin_and_eyes
-from cap4d.track.solve import FACE_SIZE, OVAL, TRANSLATION_UNIT, Observations, Problem, Solution, Weights, project
+from cap4d.track.solve import (
+    FACE_SIZE,
+    OVAL,
+    TRANSLATION_UNIT,
+    Observations,
+    Problem,
+    Solution,
+    Weights,
+    project,
+)
 
 log = logging.getLogger(__name__)
 
 ROUNDS = ((2.5, 25), (1.2, 25), (0.6, 30))
 """Blur of the images (standard deviation, px of a 300 px face) and iterations, from coarse to fine."""
-CONTEXT = 12.0  # px of a 300 px face: lightness is measured against the mean this far around, so light may change
+CONTEXT = (
+    12.0  # px of a 300 px face: lightness is measured against the mean this far around, so light may change
+)
 CONTRAST_FLOOR = 0.02  # of lightness; flat skin is not amplified beyond it
 OUTLIER = 0.5  # of normalised lightness: wrinkles, highlights and hair count linearly beyond it
-STRIDE = 2 / 300  # distance of the points, of the face's size
-DENSE_WEIGHT = 2.0
-LANDMARK_SHARE = 0.2  # what the landmarks' weights are multiplied by once the skin has its say
+STRIDE = 3 / 300  # distance of the points, of the face's size
+DENSE_WEIGHT = 4.0
+PLAIN_SHARE = 0.2  # what the weights of landmarks on plain skin are multiplied by once the skin has its say
+FEATURE_SHARE = (
+    0.5  # the same for lids, lips, brows and nose: lips roll and lids fold, which skin points cannot follow
+)
+LIPS_OUTLINE = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +75,17 @@ def refine(
         weights: As for `solve`.
     """
     weights = weights or Weights()
-    share = LANDMARK_SHARE
     lighter = replace(
-        weights, feature=share * weights.feature, plain=share * weights.plain, outline=share * weights.outline
+        weights,
+        feature=FEATURE_SHARE * weights.feature,
+        plain=PLAIN_SHARE * weights.plain,
+        outline=PLAIN_SHARE * weights.outline,
     )
     problem = Problem(landmark_rig, observations, lighter)
     points = choose_points(rig, observations, solution)
-    skin = rig.resample(points.vertices, points.bary).map(lambda a: torch.as_tensor(np.asarray(a), dtype=torch.float32))
+    skin = rig.resample(points.vertices, points.bary).map(
+        lambda a: torch.as_tensor(np.asarray(a), dtype=torch.float32)
+    )
     valid = np.flatnonzero(observations.valid)
     scale = min(1.0, FACE_SIZE / np.median(observations.face_sizes))
     lightness = np.stack([_lightness(image(t), scale) for t in valid])
@@ -89,13 +108,16 @@ def choose_points(rig: HeadRig, observations: Observations, solution: Solution) 
     width, height = observations.sizes[frame]
     focal = solution.focal[observations.camera_of[frame]]
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    camera = Camera(K, head_fixed(np.eye(4), solution.rot[frame], solution.tra[frame]), int(width), int(height))
+    camera = Camera(
+        K, head_fixed(np.eye(4), solution.rot[frame], solution.tra[frame]), int(width), int(height)
+    )
     size = 1 / (STRIDE * observations.face_sizes[frame])
     small = camera.resized(max(1, round(width * size)), max(1, round(height * size)))
     fragments = rasterize_mesh(opencv_from_rig(np.asarray(vertices, np.float64)), rig.faces, small)
-    outline = observations.points[frame][list(OVAL)] * [small.width / width, small.height / height]
+    landmarks = observations.points[frame] * [small.width / width, small.height / height]
     inside = np.zeros(fragments.face.shape, np.uint8)
-    cv2.fillPoly(inside, [np.round(outline).astype(np.int32)], 1)
+    cv2.fillPoly(inside, [np.round(landmarks[list(OVAL)]).astype(np.int32)], 1)
+    cv2.fillPoly(inside, [np.round(landmarks[list(LIPS_OUTLINE)]).astype(np.int32)], 0)
     skin, _ = skin_and_eyes(rig)
     chosen = fragments.hit & (inside > 0) & skin[fragments.face]
     return SkinPoints(rig.faces[fragments.face[chosen]].astype(np.int64), fragments.bary[chosen])
@@ -124,9 +146,9 @@ class _SkinTerm:
     def _residual(self, x: dict[str, torch.Tensor]) -> torch.Tensor:
         """[T, Q] lightness minus its mean over frames."""
         y = {name: value.float() for name, value in x.items()}
-        expr, rot, tra, eyes = (y[name][self.valid] for name in ("expr", "rot", "tra", "eye_rot"))
+        expr, rot, tra = (y[name][self.valid] for name in ("expr", "rot", "tra"))
         focal = (self.problem.prior_focal * x["focal"].exp())[self.problem.camera_of][self.valid].float()
-        head = self.skin.subject(y["shape"]).pose(expr, eye_rot=eyes)
+        head = self.skin.subject(y["shape"]).pose(expr)  # the skin does not turn with the eyes
         place = project(head, rot, tra * TRANSLATION_UNIT, focal) / self.half  # -1..1 over the image
         seen = torch.nn.functional.grid_sample(
             self.pictures, place[:, None], mode="bilinear", padding_mode="border", align_corners=False

@@ -54,7 +54,7 @@ def _posed(capture: Capture, rig: HeadRig, frame: int) -> np.ndarray:
 
 
 def _blend(photo: np.ndarray, vertices: np.ndarray, rig: HeadRig, camera: Camera) -> np.ndarray:
-    rgba = shade(vertices, rig.faces, camera, colors=rig.colors)
+    rgba = shade(vertices, rig.faces, camera, colors=rig.colors, supersample=1)
     cover = OPACITY * rgba[..., 3:]
     return photo * (1 - cover) + rgba[..., :3] * cover
 

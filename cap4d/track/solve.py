@@ -103,6 +103,7 @@ class Observations:
         sizes: int[T, 2] width and height of each image, px.
         camera_of: int[T] which camera (focal length) took the frame, 0..C-1.
         continuous: The frames follow each other in time.
+        known: bool[478] the rig has a point for the landmark; None: all.
     """
 
     points: np.ndarray
@@ -110,6 +111,7 @@ class Observations:
     sizes: np.ndarray
     camera_of: np.ndarray
     continuous: bool
+    known: np.ndarray | None = None
 
     @property
     def face_sizes(self) -> np.ndarray:
@@ -181,14 +183,14 @@ def solve(rig: HeadRig, observations: Observations, *, weights: Weights | None =
     return problem.solution(x)
 
 
-def landmark_weights(weights: Weights) -> np.ndarray:
+def landmark_weights(weights: Weights, known: np.ndarray | None = None) -> np.ndarray:
     """float64[478]"""
     w = np.full(N_LANDMARKS, weights.plain)
     w[list(FEATURES)] = weights.feature
     w[list(OVAL)] = weights.outline
     w[IRIS["right"] :] = 0
     w[list(IRIS.values())] = weights.iris
-    return w
+    return w if known is None else w * known
 
 
 def project(points: torch.Tensor, rot: torch.Tensor, tra: torch.Tensor, focal: torch.Tensor) -> torch.Tensor:
@@ -209,7 +211,7 @@ def reprojection_errors(rig: HeadRig, observations: Observations, solution: Solu
         distance = (problem.predicted(x) - problem.points).norm(dim=-1).numpy()
     errors = distance * (512 / observations.sizes.max(1))[:, None]
     errors[~observations.valid] = np.nan
-    errors[:, landmark_weights(Weights()) == 0] = np.nan
+    errors[:, landmark_weights(Weights(), observations.known) == 0] = np.nan
     return errors
 
 
@@ -276,9 +278,9 @@ class Problem:
         only: tuple[int, ...] | None = None,
     ) -> None:
         """L-BFGS over the named variables, in place."""
-        weight = torch.as_tensor(landmark_weights(self.weights))
+        weight = torch.as_tensor(landmark_weights(self.weights, self.observations.known))
         if only is not None:
-            weight = torch.zeros_like(weight).index_fill(0, torch.tensor(only), 1.0)
+            weight = (weight > 0) * torch.zeros_like(weight).index_fill(0, torch.tensor(only), 1.0)
         for name in x:
             x[name] = x[name].detach().requires_grad_(name in free)
         variables = [x[name] for name in free]
@@ -299,7 +301,9 @@ class Problem:
             return energy
 
         energy = optimiser.step(closure)
-        log.debug("%s: energy %.1f -> %.1f", ", ".join(free), float(energy.detach()), float(closure().detach()))
+        log.debug(
+            "%s: energy %.1f -> %.1f", ", ".join(free), float(energy.detach()), float(closure().detach())
+        )
 
     def evidence(self, x: dict[str, torch.Tensor], weight: torch.Tensor) -> torch.Tensor:
         """Robust squares of the residuals and of the errors of the gaps between lids and lips."""

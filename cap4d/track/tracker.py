@@ -8,17 +8,18 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from cap4d.camera import Camera
 from cap4d.capture.capture import Capture, save_capture
-from cap4d.capture.image import write_image
+from cap4d.capture.image import read_image, write_image
 from cap4d.errors import ArgumentError, DataError
 from cap4d.rig.head import HeadRig
 from cap4d.track.correspondence import find_correspondence
+from cap4d.track.dense import refine
 from cap4d.track.footage import Footage, open_footage
 from cap4d.track.landmarks import N_LANDMARKS, Detector, without_native_chatter
 from cap4d.track.matte import refine_matte
@@ -28,6 +29,8 @@ from cap4d.track.progress import progress
 from cap4d.track.solve import Observations, Solution, interpolate_invalid, reprojection_errors, solve
 
 log = logging.getLogger(__name__)
+
+MIN_DENSE_FRAMES = 5  # fewer frames say too little about what a point of the skin looks like
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,16 @@ def track(source: str | Path, rig: HeadRig, output: str | Path, *, overlay: bool
         log.info("%s: a face in %d of %d frames", source, observations.valid.sum(), len(observations.valid))
         with without_native_chatter():
             correspondence = find_correspondence(rig)
+        observations = replace(observations, known=correspondence.known)
         points = rig.resample(correspondence.vertices, correspondence.bary)
-        solution = interpolate_invalid(solve(points, observations), observations.valid)
+        log.info("solving for %d frames", len(observations.valid))
+        solution = solve(points, observations)
+        if footage.is_video and observations.valid.sum() >= MIN_DENSE_FRAMES:
+            log.info("refining on the skin")
+            solution = refine(
+                rig, points, observations, solution, lambda t: _stored_image(folder, observations, t)
+            )
+        solution = interpolate_invalid(solution, observations.valid)
         errors = reprojection_errors(points, observations, solution)
         _write(folder, footage, rig, observations, solution, float(np.nanmedian(errors)))
         if overlay:
@@ -127,6 +138,12 @@ def _look(footage: Footage, folder: Path) -> Observations:
         raise DataError(footage.source, "images", expected="a face", found=f"none in {len(points)}")
     found = np.stack([np.zeros((N_LANDMARKS, 2)) if p is None else p for p in points])
     return Observations(found, valid, np.array(sizes), _camera_of(footage, sizes), footage.is_video)
+
+
+def _stored_image(folder: Path, observations: Observations, frame: int) -> np.ndarray:
+    """uint8[H, W, 3]"""
+    path = folder / f"images/cam{observations.camera_of[frame]}/{frame:05d}.png"
+    return np.rint(read_image(path) * 255).astype(np.uint8)
 
 
 def _camera_of(footage: Footage, sizes: list[tuple[int, int]]) -> np.ndarray:
