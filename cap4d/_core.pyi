@@ -19,7 +19,7 @@ def rasterize_mesh(
     """xyz [V, 3] px, px, depth -> triangle per pixel [H, W] (-1: none) and its barycentrics [H, W, 3]."""
 
 def sort_by_depth(means: _F32, viewmat: _F32, threads: int = 0) -> NDArray[np.uint32]:
-    """Order [N] of means [N, 3] near to far along the axis of viewmat [4, 4]; stable. Non-finite come last."""
+    """Order [N] of means [N, 3] near to far along viewmat [4, 4]; stable. Non-finite come last."""
 
 def bind(
     vertices: _F32, faces: _I32, means: _F32, quats: _F32, log_scales: _F32, binding: _I32, threads: int = 0
@@ -99,7 +99,7 @@ def rasterize_vjp(
     v_depth: _F32 | None,
     threads: int = 0,
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
-    """Gradients of means, quats, scales, opacities, sh and means2d, given all that went into and out of `rasterize`."""
+    """Gradients of means, quats, scales, opacities, sh, means2d from all that went into and out of `rasterize`."""
 
 def isa() -> Literal["base", "v3", "v4"]:
     """The x86-64 level of the inner loops in use (CAP4D_ISA asks for a lower one)."""

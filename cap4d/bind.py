@@ -1,7 +1,7 @@
 """Gaussians that ride on triangles: local parameters and a posed mesh to posed Gaussians.
 
-GaussianAvatars (Qian et al. 2024, section 3.1) with the frames of fact 27. One set of functions for NumPy and torch (which
-gives gradients), and the C++ form of the same for playing.
+GaussianAvatars (Qian et al. 2024, section 3.1) with the frames of fact 27. One set of functions for
+NumPy and torch (which gives gradients), and the C++ form of the same for playing.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from cap4d import _core
 from cap4d.rotation import Array, namespace, quat_multiply, rotmat_to_quat
 
 SAFE_NORM2 = 1e-20
-"""Squared lengths are kept above this, so that a triangle without area has a finite frame and gradient (fact 27)."""
+"""Squared lengths are kept above this: a triangle without area has a finite frame and gradient (fact 27)."""
 
 
 def triangle_frames(vertices: Array, faces: Array) -> tuple[Array, Array, Array]:
@@ -22,8 +22,8 @@ def triangle_frames(vertices: Array, faces: Array) -> tuple[Array, Array, Array]
         vertices: [..., G, 3] m.
         faces: int[M, 3].
     Returns:
-        centres [..., M, 3] m, rotmats [..., M, 3, 3] with columns (first edge, normal, minus normal x edge), sizes [..., M] m:
-        the mean of the first edge and the height over it.
+        centres [..., M, 3] m; rotmats [..., M, 3, 3] with columns first edge, normal, minus normal x edge;
+        sizes [..., M] m: the mean of the first edge and the height over it.
     """
     xp = namespace(vertices)
     v0, v1, v2 = (vertices[..., faces[:, i], :] for i in range(3))
@@ -35,7 +35,9 @@ def triangle_frames(vertices: Array, faces: Array) -> tuple[Array, Array, Array]
     return (v0 + v1 + v2) / 3, xp.stack([a0, a1, a2], -1), sizes
 
 
-def bind(frames: tuple[Array, Array, Array], *, means: Array, quats: Array, log_scales: Array, binding: Array) -> tuple[Array, Array, Array]:
+def bind(
+    frames: tuple[Array, Array, Array], *, means: Array, quats: Array, log_scales: Array, binding: Array
+) -> tuple[Array, Array, Array]:
     """Posed Gaussians from their triangles' frames (fact 27).
 
     Args:
@@ -56,7 +58,14 @@ def bind(frames: tuple[Array, Array, Array], *, means: Array, quats: Array, log_
 
 
 def bind_fast(
-    vertices: np.ndarray, faces: np.ndarray, *, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, binding: np.ndarray, threads: int = 0
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    means: np.ndarray,
+    quats: np.ndarray,
+    log_scales: np.ndarray,
+    binding: np.ndarray,
+    threads: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`bind(triangle_frames(vertices, faces), ...)` in C++.
 

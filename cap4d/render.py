@@ -34,9 +34,9 @@ def render(
 ) -> Rendered:
     """Splats Gaussians (Kerbl et al. 2023) with the tiled C++ renderer.
 
-    EWA projection with a low-pass of 0.3 px^2; alpha = min(0.99, opacity * density); contributions below 1/255 are skipped; a
-    pixel ends before its transmittance would fall below 1e-4. A Gaussian with a non-finite field is not drawn.
-    The picture has the same bits for any number of threads.
+    EWA projection with a low-pass of 0.3 px^2; alpha = min(0.99, opacity * density); contributions below 1/255
+    are skipped; a pixel ends before its transmittance would fall below 1e-4. A Gaussian with a non-finite field is
+    not drawn. The picture has the same bits for any number of threads.
 
     Args:
         gaussians: N Gaussians in world space, m.
@@ -44,6 +44,11 @@ def render(
         background: sRGB, or None for premultiplied colour.
         threads: 0 uses all cores (or CAP4D_THREADS).
     """
-    arrays = (np.ascontiguousarray(a) for a in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh))
+    arrays = (
+        np.ascontiguousarray(a)
+        for a in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    )
     colour = None if background is None else tuple(map(float, background))
-    return Rendered(*_core.render(*arrays, camera.viewmat, camera.K, camera.width, camera.height, colour, -1, threads))
+    return Rendered(
+        *_core.render(*arrays, camera.viewmat, camera.K, camera.width, camera.height, colour, -1, threads)
+    )

@@ -24,7 +24,7 @@ class Rasterized:
         rgb: [H, W, 3] composited on the background (premultiplied by alpha without one).
         alpha: [H, W] coverage.
         depth: [H, W] expected depth, m; 0 where alpha is 0.
-        means2d: [N, 2] image positions, px (0 where not drawn). After `backward`, `means2d.grad` is dL/d(position) per px,
+        means2d: [N, 2] image positions, px (0 where not drawn). After `backward`, its `.grad` is dL/d(position) per px,
             which densification reads. Nothing flows back through the values themselves.
         radii: int32[N] three standard deviations, px, rounded up; 0 for a Gaussian that is not drawn.
     """
@@ -86,9 +86,16 @@ def rasterize(
     raise ArgumentError(f"backend: expected auto, cpu, gsplat or reference, got {backend}")
 
 
-def _check(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, sh_degree: int | None) -> None:
+def _check(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, sh_degree: int | None
+) -> None:
     n = len(means)
-    fields = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3)), "opacities": (opacities, (n,))}
+    fields = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+    }
     for name, (value, shape) in fields.items():
         if tuple(value.shape) != shape or not torch.is_floating_point(value):
             raise ArgumentError(f"{name}: expected float{list(shape)}, got {value.dtype}{list(value.shape)}")
@@ -96,3 +103,27 @@ def _check(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: 
         raise ArgumentError(f"sh: expected float[{n}, 1|4|9|16, 3], got {sh.dtype}{list(sh.shape)}")
     if sh_degree is not None and not 0 <= sh_degree <= SH_COUNTS[sh.shape[1]]:
         raise ArgumentError(f"sh_degree: expected 0 to {SH_COUNTS[sh.shape[1]]}, got {sh_degree}")
+
+
+def collecting_leaf(positions: Tensor, ids: Tensor, count: int) -> Tensor:
+    """`Rasterized.means2d` of a backend whose positions are part of the graph.
+
+    Args:
+        positions: [..., V, 2] px; its gradient is copied as it passes.
+        ids: int64[V], rows of the result.
+        count: N.
+    Returns:
+        [N, 2] leaf with the positions, zero elsewhere.
+    """
+    leaf = positions.new_zeros(count, 2)
+    leaf[ids] = positions.detach().reshape(-1, 2)
+    if positions.requires_grad:
+        leaf.requires_grad_()
+
+        def collect(v_positions: Tensor) -> None:
+            grad = torch.zeros_like(leaf)
+            grad[ids] = v_positions.reshape(-1, 2)
+            leaf.grad = grad if leaf.grad is None else leaf.grad + grad
+
+        positions.register_hook(collect)
+    return leaf

@@ -1,4 +1,4 @@
-"""Splatting as one reads it: float64, every Gaussian at every pixel, gradients by autograd. For small pictures and for tests.
+"""Splatting as one reads it: float64, every Gaussian at every pixel, gradients by autograd. For small pictures.
 
 The stages have the names and the order of src/cpp: `project`, `eval_sh`, `composite`.
 """
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cap4d.camera import NEAR, Camera
-from cap4d.raster.rasterize import Rasterized
+from cap4d.raster.rasterize import Rasterized, collecting_leaf
 from cap4d.rotation import quat_to_rotmat
 
 EPS2D = 0.3  # px^2; these constants are those of src/cpp/constants.h, where each has its provenance
@@ -20,6 +20,7 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
 QUAT_MIN = 1e-12
+COLOR_MAX = 1e6
 RADIUS_SIGMAS = 3.0
 
 PAIRS_AT_ONCE = 1 << 22
@@ -32,7 +33,9 @@ class Projected:
 
     Args:
         ids: int64[V] which of the N.
-        means2d: [V, 2] px. conics: [V, 3] 1/px^2: a, b, c of exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2). depths: [V] m.
+        means2d: [V, 2] px.
+        conics: [V, 3] 1/px^2: a, b, c of the density exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2).
+        depths: [V] m.
         radii: int32[V] px.
     """
 
@@ -58,39 +61,51 @@ def rasterize_reference(
     """`rasterize`, readable. The arguments are those of `rasterize`, checked; computes and returns float64.
 
     Args:
-        smooth_cutoff: 0 is the real thing: contributions below 1/255 are skipped, a pixel ends at transmittance 1e-4 and alpha is
-            clamped at 0.99. Positive: a twin without steps and kinks for finite differences, in which contributions fade in around
-            1/255 over this share of it, pixels never end, and alpha is 0.99 times the opacity times the density.
+        smooth_cutoff: 0 is the real thing: contributions below 1/255 are skipped, a pixel ends at transmittance
+            1e-4 and alpha is clamped at 0.99. Positive: a twin without steps and kinks for finite differences, in
+            which contributions fade in around 1/255 over this share of it, pixels never end, and alpha is 0.99
+            times the opacity times the density.
     """
     gaussians = tuple(x.double() for x in (means, quats, scales, opacities, sh))
-    keep = drawable(*gaussians[:4], gaussians[4][:, : (sh_degree + 1) ** 2], camera)
-    means, quats, scales, opacities, sh = (x[keep] for x in gaussians)
+    colors = eval_sh(gaussians[4], gaussians[0] - gaussians[0].new_tensor(camera.position), sh_degree)
+    keep = drawable(*gaussians[:4], colors, camera)
+    means, quats, scales, opacities, colors = (x[keep] for x in (*gaussians[:4], colors))
     projected = project(means, quats, scales, opacities, camera=camera)
-    ids = projected.ids
-    colors = eval_sh(sh[ids], means[ids] - means.new_tensor(camera.position), sh_degree)
-    means2d = projected.means2d
-    if means2d.requires_grad:
-        means2d.retain_grad()
+    ids, means2d = projected.ids, projected.means2d
+    colors = colors[ids].clamp(min=0)
     rgb, alpha, depth = composite(
-        means2d, projected.conics, opacities[ids], colors, projected.depths, camera=camera, smooth_cutoff=smooth_cutoff
+        means2d,
+        projected.conics,
+        opacities[ids],
+        colors,
+        projected.depths,
+        camera=camera,
+        smooth_cutoff=smooth_cutoff,
     )
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * rgb.new_tensor(background)
     depth = torch.where(alpha > 0, depth / torch.where(alpha > 0, alpha, 1), 0)
-    all_radii = torch.zeros(len(keep), dtype=torch.int32)
-    all_radii[keep.nonzero()[:, 0][ids]] = projected.radii
-    return Rasterized(rgb, alpha, depth, _scattered(means2d, keep.nonzero()[:, 0][ids], len(keep)), all_radii)
+    gaussian_from_projected = keep.nonzero()[:, 0][ids]
+    radii = torch.zeros(len(keep), dtype=torch.int32)
+    radii[gaussian_from_projected] = projected.radii
+    leaf = collecting_leaf(means2d, gaussian_from_projected, len(keep))
+    return Rasterized(rgb, alpha, depth, leaf, radii)
 
 
-def drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, camera: Camera) -> Tensor:
-    """bool[N]: finite in every field, in front of the camera, and not too faint to see."""
-    depths = means @ means.new_tensor(camera.viewmat[2, :3]) + camera.viewmat[2, 3]
-    fields = (means, quats, scales, opacities[:, None], sh.flatten(1))
-    finite = torch.stack([torch.isfinite(x.detach()).all(1) for x in fields]).all(0)
-    return finite & (depths.detach() >= NEAR) & (opacities.detach() >= ALPHA_MIN)
+def drawable(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera
+) -> Tensor:
+    """bool[N]: finite in every field, in front of the camera, not too faint to see, and of a sane colour."""
+    with torch.no_grad():
+        depths = means @ means.new_tensor(camera.viewmat[2, :3]) + camera.viewmat[2, 3]
+        fields = (means, quats, scales, opacities[:, None])
+        finite = torch.stack([torch.isfinite(x).all(1) for x in fields]).all(0)
+        return finite & (depths >= NEAR) & (opacities >= ALPHA_MIN) & (colors.abs() <= COLOR_MAX).all(1)
 
 
-def project(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, *, camera: Camera, eps2d: float = EPS2D) -> Projected:
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, *, camera: Camera, eps2d: float = EPS2D
+) -> Projected:
     """Projects Gaussians onto the image plane with the EWA approximation.
 
     Zwicker et al. 2002, eq. 31; the Jacobian is clamped at 1.3x the field of view (as in gsplat).
@@ -129,9 +144,14 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, *, 
 
 
 def eval_sh(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Colours [V, 3] = max(0, 0.5 + SH) of coefficients [V, S, 3] seen along directions [V, 3] (any length), camera to Gaussian."""
+    """Colours [V, 3] = 0.5 + SH, before the clamp at 0.
+
+    Args:
+        sh: [V, S, 3] coefficients.
+        directions: [V, 3] from the camera to the Gaussians, any length.
+    """
     basis = sh_basis(directions / directions.norm(dim=1, keepdim=True), degree)
-    return ((basis[..., None] * sh[:, : (degree + 1) ** 2]).sum(1) + 0.5).clamp(min=0)
+    return (basis[..., None] * sh[:, : (degree + 1) ** 2]).sum(1) + 0.5
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -161,7 +181,9 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack([b for band in bands[: degree + 1] for b in band], 1)
 
 
-def pixel_alphas(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, *, smooth_cutoff: float = 0.0) -> Tensor:
+def pixel_alphas(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, *, smooth_cutoff: float = 0.0
+) -> Tensor:
     """[P, V] opacity of each Gaussian at pixel centres [P, 2]."""
     dx, dy = (pixels[:, None] - means2d).unbind(-1)
     a, b, c = conics.unbind(1)
@@ -174,7 +196,7 @@ def pixel_alphas(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Ten
 
 
 def blend_weights(alphas: Tensor, *, stop: bool = True) -> Tensor:
-    """[P, V] share of each Gaussian, near to far, in each pixel: alpha times what those before it let through.
+    """[P, V] share of each Gaussian, near to far, in each pixel: its alpha times what those before let pass.
 
     The Gaussian that would take the transmittance below 1e-4, and all behind it, are left out.
     """
@@ -184,9 +206,16 @@ def blend_weights(alphas: Tensor, *, stop: bool = True) -> Tensor:
 
 
 def composite(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, depths: Tensor, *, camera: Camera, smooth_cutoff: float = 0.0
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    depths: Tensor,
+    *,
+    camera: Camera,
+    smooth_cutoff: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Premultiplied rgb [H, W, 3], alpha [H, W] and accumulated depth [H, W] of Gaussians that come near to far."""
+    """Premultiplied rgb [H, W, 3], alpha [H, W], accumulated depth [H, W]; the Gaussians come near to far."""
     if not len(means2d):
         empty = means2d.new_zeros(camera.height, camera.width)
         return empty[..., None].expand(-1, -1, 3), empty, empty
@@ -200,19 +229,3 @@ def composite(
     rgb, alpha, depth = torch.cat(rows).split([3, 1, 1], 1)
     shape = (camera.height, camera.width)
     return rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape)
-
-
-def _scattered(means2d: Tensor, ids: Tensor, count: int) -> Tensor:
-    """A [N, 2] leaf whose gradient is filled from the V rows' when those get theirs."""
-    leaf = means2d.new_zeros(count, 2)
-    leaf[ids] = means2d.detach()
-    if means2d.requires_grad:
-        leaf.requires_grad_()
-
-        def collect(v_means2d: Tensor) -> None:
-            grad = torch.zeros_like(leaf)
-            grad[ids] = v_means2d
-            leaf.grad = grad if leaf.grad is None else leaf.grad + grad
-
-        means2d.register_hook(collect)
-    return leaf

@@ -21,6 +21,8 @@ inline constexpr float kTransmittanceMin = 1e-4f;
 inline constexpr float kQuatMin = 1e-12f;
 // Guard of every division by a length in the triangle frames (GaussianAvatars; fact 27).
 inline constexpr float kSafeNorm2 = 1e-20f;
+// A Gaussian with a colour beyond this is bad data and not drawn: sums and gradients of what is drawn cannot overflow.
+inline constexpr float kColorMax = 1e6f;
 // How far out, in standard deviations, the radius that densification prunes by reaches (3DGS).
 inline constexpr float kRadiusSigmas = 3.0f;
 

@@ -64,6 +64,8 @@ CAP4D_INLINE Float4 sh_color(const float* sh, int count, const float basis[][kLa
   return even + odd + basis[last][lane] * Float4{sh[3 * last], sh[3 * last + 1], sh[3 * last + 2], 0.0f};
 }
 
+CAP4D_INLINE bool sane(float channel) { return channel <= kColorMax && channel >= -kColorMax; }  // false for NaN
+
 int radius_of(float xx, float xy, float yy) {
   const float middle = 0.5f * (xx + yy), half = 0.5f * (xx - yy);
   const float longest = middle + std::sqrt(half * half + xy * xy);
@@ -118,7 +120,7 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
       const int l = __builtin_ctz(todo);
       const std::size_t id = first + l;
       const Float4 color = sh_color(g.sh + 3 * g.sh_count * id, used, basis, l);
-      if (!(color[0] * 0.0f + color[1] * 0.0f + color[2] * 0.0f == 0.0f)) continue;
+      if (!sane(color[0]) || !sane(color[1]) || !sane(color[2])) continue;
       Splat& s = splats[id];
       s.x = fields[0][l], s.y = fields[1][l], s.a = fields[2][l], s.b = fields[3][l], s.c = fields[4][l], s.log2_opacity = fields[5][l];
       s.red = std::max(color[0], 0.0f), s.green = std::max(color[1], 0.0f), s.blue = std::max(color[2], 0.0f);

@@ -122,7 +122,8 @@ CAP4D_INLINE bool finished(FloatV transmittance) { return !any(less(splat(0.0f),
 }  // namespace
 
 void rasterize_fwd(const TileJob& job, const Image& image) {
-  FloatV transmittance[kBlocks], red[kBlocks] = {}, green[kBlocks] = {}, blue[kBlocks] = {}, depth[kBlocks] = {};
+  // Alpha is summed: 1 - transmittance has no digits left where little is seen, and depth is divided by it.
+  FloatV transmittance[kBlocks], red[kBlocks] = {}, green[kBlocks] = {}, blue[kBlocks] = {}, alpha[kBlocks] = {}, depth[kBlocks] = {};
   BlockSet open = open_pixels(job, transmittance);
   for (std::size_t i = 0; i < job.count && open; ++i) {
     const Splat& s = splat_at(job, i);
@@ -133,6 +134,7 @@ void rasterize_fwd(const TileJob& job, const Image& image) {
       red[block] += c.weight * s.red;
       green[block] += c.weight * s.green;
       blue[block] += c.weight * s.blue;
+      alpha[block] += c.weight;
       depth[block] += c.weight * s.depth;
       transmittance[block] = c.next;
       if (any(c.stop) && finished(c.next)) open &= ~(BlockSet{1} << block);
@@ -148,8 +150,9 @@ void rasterize_fwd(const TileJob& job, const Image& image) {
       image.rgb[3 * at] = red[block][l] + t * job.background[0];
       image.rgb[3 * at + 1] = green[block][l] + t * job.background[1];
       image.rgb[3 * at + 2] = blue[block][l] + t * job.background[2];
-      image.alpha[at] = 1.0f - t;
-      image.depth[at] = t < 1.0f ? depth[block][l] / (1.0f - t) : 0.0f;
+      const float a = alpha[block][l];
+      image.alpha[at] = a < 1.0f ? a : 1.0f;
+      image.depth[at] = a > 0.0f ? depth[block][l] / a : 0.0f;
     }
 }
 
