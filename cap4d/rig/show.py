@@ -4,6 +4,8 @@ expressions.
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,11 +15,15 @@ from cap4d.camera import Camera, opencv_from_rig, orbit_camera
 from cap4d.mesh import shade
 from cap4d.rig.head import HeadRig
 
+log = logging.getLogger(__name__)
+
 TILE = 176  # px, a side of one picture
 COLUMNS = 9
 IDENTITY_MODES = 9
 STRENGTH = 2.0  # of an identity mode, in standard deviations
 FOV_DEG = 14.0
+TURNS = {"front": 0, "three-quarter": 40, "side": 90, "back": 180}  # of the camera, degrees
+PROGRESS_SECONDS = 2.0
 MARGIN = 1.12  # of the view around the head
 
 # 5 x 7 letters: the letter, then seven rows of five bits, top row first, two hexadecimal digits a row.
@@ -39,7 +45,15 @@ def contact_sheet(rig: HeadRig, path: Path) -> None:
     """
     from cap4d.player.png import write_png
 
-    tiles = [label(picture, name) for name, picture in pictures(rig)]
+    total = len(TURNS) + 2 + 2 * min(IDENTITY_MODES, rig.n_identity) + rig.n_expressions
+    tiles, start, reported = [], time.monotonic(), 0.0
+    for name, picture in pictures(rig):
+        tiles.append(label(picture, name))
+        seconds = time.monotonic() - start
+        if seconds - reported > PROGRESS_SECONDS:
+            reported = seconds
+            left = seconds / len(tiles) * (total - len(tiles))
+            log.info("%d of %d pictures, %.0f s left", len(tiles), total, left)
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
     rows = [np.concatenate(tiles[i : i + COLUMNS], 1) for i in range(0, len(tiles), COLUMNS)]
     write_png(Path(path), np.concatenate(rows, 0))
@@ -49,10 +63,8 @@ def pictures(rig: HeadRig) -> Iterator[tuple[str, np.ndarray]]:
     """Name and uint8[TILE, TILE, 3] of each picture of the sheet."""
     rest = np.zeros(rig.n_expressions, np.float32)
     neutral = rig.subject()
-    yield "front", draw(rig, neutral.pose(rest))
-    yield "three-quarter", draw(rig, neutral.pose(rest), yaw_deg=40)
-    yield "side", draw(rig, neutral.pose(rest), yaw_deg=90)
-    yield "back", draw(rig, neutral.pose(rest), yaw_deg=180)
+    for name, yaw_deg in TURNS.items():
+        yield name, draw(rig, neutral.pose(rest), yaw_deg=yaw_deg)
     turn = np.float32([-0.2, 0.4, 0])
     yield "eyes turned", draw(rig, neutral.pose(rest, eye_rot=turn))
     yield "neck bent", draw(rig, neutral.pose(rest, neck_rot=turn))
