@@ -35,7 +35,10 @@ class Deformer:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self.source, self.size = source, size
         try:
-            self.session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+            # The "fallback" would try the same again and print a banner.
+            self.session = onnxruntime.InferenceSession(
+                model, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
         except Exception as error:  # onnxruntime's own types; all mean that the network is not sound
             raise DataError(
                 source, "network", expected="one that onnxruntime loads", found=str(error)[:200]

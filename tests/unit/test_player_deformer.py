@@ -45,9 +45,20 @@ def test_the_answer_does_not_depend_on_the_number_of_threads(model: bytes) -> No
 
 
 @pytest.mark.parametrize("data", [b"", b"rubbish" * 10])
-def test_what_onnxruntime_cannot_load_is_a_data_error(data: bytes) -> None:
+def test_what_onnxruntime_cannot_load_is_a_data_error(data: bytes, capfd: pytest.CaptureFixture) -> None:
     with pytest.raises(DataError, match=r"here: network: expected one that onnxruntime loads"):
         Deformer(data, size=SIZE, source="here")
+    assert capfd.readouterr() == ("", ""), "one line is the command line's to print"
+
+
+def test_an_operator_that_cannot_run_is_a_data_error(model: bytes, capfd: pytest.CaptureFixture) -> None:
+    import onnx
+
+    proto = onnx.load_from_string(model)
+    del proto.graph.node[1].attribute[:]
+    with pytest.raises(DataError, match="network"):
+        Deformer(proto.SerializeToString(), size=SIZE)(offsets(0))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_another_size_is_a_data_error(model: bytes) -> None:
