@@ -136,7 +136,8 @@ def add_rig(commands) -> None:
         kind.add_argument("-o", "--output", type=Path, required=True, metavar="RIG.npz")
     show = command(verbs, "show", run_show_rig, "draw a rig and each of its expressions", "cap4d rig show ict.npz -o ict.png")
     show.add_argument("rig", type=Path, metavar="RIG.npz")
-    show.add_argument("-o", "--output", type=Path, help="PNG sheet to write (default: beside the rig)")
+    show.add_argument("--on", type=Path, metavar="CAPTURE", help="draw it over the first photo of a capture instead")
+    show.add_argument("-o", "--output", type=Path, help="PNG to write (default: beside the rig)")
 
 
 def run_import_flame(arguments: argparse.Namespace) -> None:
@@ -169,13 +170,22 @@ def write_rig(rig, output: Path) -> None:
 
 
 def run_show_rig(arguments: argparse.Namespace) -> None:
-    from cap4d.rig.show import contact_sheet
     from cap4d.rig.store import load_rig
 
     rig = load_rig(arguments.rig)
     output = arguments.output or arguments.rig.with_suffix(".png")
-    contact_sheet(rig, output)
-    print(f"{output}: {rig.name}, {', '.join(rig.expression_names)}")
+    if arguments.on is None:
+        from cap4d.rig.show import contact_sheet
+
+        contact_sheet(rig, output)
+    else:
+        from cap4d.capture.capture import Capture
+        from cap4d.capture.image import write_image
+        from cap4d.track.overlay import draw_overlay
+
+        capture = Capture.load(arguments.on)
+        write_image(output, draw_overlay(capture, rig, capture.views[0]).astype("float32") / 255)
+    print(f"{output}: {rig.name}, {len(rig.expression_names)} expressions: {', '.join(rig.expression_names)}")
 
 
 def load_rig_or_builtin(path: Path | None):
