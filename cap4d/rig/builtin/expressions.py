@@ -26,27 +26,22 @@ class Face:
 
     Args:
         p: [V, 3] mm.
-        skin, pouch: bool[V].
+        skin: bool[V].
         below: [V] 0 above the mouth's opening, 1 below it, between at and beyond the corners.
         jaw: [V] how far the vertex follows the lower jaw.
-        lip: [V] 1 on the red of the lips and inside, falling to 0 over a centimetre of skin around.
         lid: [V] 1 upper lid, -1 lower lid, 0 neither; `lid_share` how far it follows its rim.
         close: [V] rad about the eyeball's lateral axis by which a vertex's rim turns to meet the other lid.
-        seams: pairs of vertex arrays (pouch, skin) that lie on each other, and for each pouch vertex its
-            place in
-            between: see `lining`.
+        lining: For the vertices of the mouth's pouch: their ids, the skin vertices [N, 2] behind the upper
+            and the lower lip that they hang on, and their place between these in [0, 1].
     """
 
     p: np.ndarray
     skin: np.ndarray
-    pouch: np.ndarray
     below: np.ndarray
     jaw: np.ndarray
-    lip: np.ndarray
     lid: np.ndarray
     lid_share: np.ndarray
     close: np.ndarray
-    eye: np.ndarray
     lining: tuple[np.ndarray, np.ndarray, np.ndarray]
     mesh: Mesh
 
@@ -138,26 +133,17 @@ def read_face(mesh: Mesh) -> Face:
     sidewall = _at_corner(theta[pouch])
     jaw[pouch] = (1 - sidewall) * smoothstep(0.25, 0.75, row[pouch]) + 0.5 * sidewall
     jaw[pouch] *= smoothstep(10, 40, p[pouch, 2])
-    top, bottom = row_of("upper_vermilion"), row_of("lower_vermilion")
-    lip = (
-        smoothstep(top - 6, top + 1, row)
-        * smoothstep(bottom + 6, bottom - 1, row)
-        * smoothstep(CORNER + 12, CORNER - 1, theta)
-    )
     lid, share, close = _lids(p, row, column, skin, grid)
     return Face(
-        p,
-        skin,
-        pouch,
-        np.where(skin, below, 0),
-        jaw,
-        np.where(skin, lip, 0),
-        lid,
-        share,
-        close,
-        mesh.of("eye"),
-        _lining(mesh),
-        mesh,
+        p=p,
+        skin=skin,
+        below=np.where(skin, below, 0),
+        jaw=jaw,
+        lid=lid,
+        lid_share=share,
+        close=close,
+        lining=_lining(mesh),
+        mesh=mesh,
     )
 
 
@@ -187,7 +173,7 @@ def _below(p: np.ndarray, row: np.ndarray, theta: np.ndarray, skin: np.ndarray) 
 
 
 def _at_corner(theta: np.ndarray) -> np.ndarray:
-    """0 at the mouth's middle, 1 at its corner and beyond; what is left of 1 is the shape of the open mouth."""
+    """0 at the mouth's middle, 1 at its corner and beyond; the rest to 1 is the open mouth's shape."""
     return 1 - np.maximum(1 - np.minimum(theta / CORNER, 1) ** 2.2, 0) ** 0.75
 
 
@@ -335,7 +321,7 @@ def mouth_left(f: Face) -> np.ndarray:
 def mouth_smile(f: Face) -> np.ndarray:
     corner = _corner(f, (6.5, 7.5, -4.2), (13, 13))
     cheek = f.lump((40, -24), (15, 14), (1.6, 4.2, 2.6))
-    fold = f.lump((32, -40), (6, 11), (1.0, 0.6, -0.6))
+    fold = f.lump((29, -37), (4.5, 12), (0, 0, -1.3)) + f.lump((38, -36), (8, 13), (1.2, 1.4, 1.4))
     upper = f.upper(f.lump((11, -48), (11, 7), (1.2, 1.6, -1.2)))
     lower = f.lower(f.lump((11, -60), (11, 8), (1.0, 1.0, -0.8)))
     return corner + cheek + fold + upper + lower + f.lids(0.03, 0.5)
@@ -425,7 +411,7 @@ def brow_outer_up(f: Face) -> np.ndarray:
 
 
 def cheek_puff(f: Face) -> np.ndarray:
-    cheeks = f.lump_both((36, -45), (19, 19), (6.5, 0, 7.5))
+    cheeks = f.lump_both((37, -45), (20, 19), (8.5, 0, 9.0))
     return cheeks + f.lump((0, -52), (16, 16), (0, 0, 2.6)) + f.lump_both((21, -54), (9, 9), (-2.4, 0, 1.0))
 
 

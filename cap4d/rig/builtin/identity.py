@@ -58,7 +58,6 @@ FIELDS: dict[str, Field] = {
     "eye_spacing": lambda p: _along(_side(p), 0, 0, 1.7 * _near(p, (32, 20, 66), (24, 20, 30))),
     "eye_height": lambda p: _along(0, 1, 0, 2.0 * _near(p, (32, 22, 66), (28, 22, 34))),
     "eye_depth": lambda p: _along(0, 0, -1, 1.6 * _near(p, (33, 22, 68), (24, 18, 30))),
-    "eye_tilt": lambda p: _along(0, 0.09 * (np.abs(p[:, 0]) - 33), 0, _near(p, (33, 20, 70), (22, 13, 30))),
     "mouth_width": lambda p: _along(0.08 * p[:, 0], 0, 0, _near(p, (0, -54, 84), (38, 17, 34))),
     "mouth_height": lambda p: _along(0, 1, 0, 2.0 * _near(p, (0, -54, 84), (36, 17, 40))),
     "cheek_fullness": lambda p: _along(
@@ -85,7 +84,12 @@ FIELDS: dict[str, Field] = {
         0, 0.16 * (p[:, 1] + 53.5), 1.3, _near(p, (0, -54, 90), (22, 10.5, 16)) * _front(p)
     ),
 }
-EYE_SCALE = 0.045  # the one mode that is not a field of places alone: the ball grows with its lids
+EYE_SCALE, EYE_TILT = 0.055, 0.08  # of the two modes about the eyeball's centre; the tilt in rad
+
+
+def _own_eye(p: np.ndarray) -> np.ndarray:
+    """[N, 3] the centre of the eyeball on each point's side."""
+    return EYE * np.where(p[:, :1] < 0, [-1, 1, 1], [1, 1, 1])
 
 
 def carried(field: Field, p: np.ndarray, ball: np.ndarray) -> np.ndarray:
@@ -95,26 +99,38 @@ def carried(field: Field, p: np.ndarray, ball: np.ndarray) -> np.ndarray:
         p: [N, 3] mm.
         ball: bool[N] points of the eyeballs.
     """
-    centre = np.stack(
-        [EYE[0] * np.where(p[:, 0] < 0, -1, 1), np.full(len(p), EYE[1]), np.full(len(p), EYE[2])], -1
-    )
+    centre = _own_eye(p)
     rigid = np.where(ball, 1, smoothstep(30, 20, np.linalg.norm(p - centre, axis=1)))[:, None]
     at_eye = field(np.stack([EYE, EYE * [-1, 1, 1]]))
     return (1 - rigid) * field(p) + rigid * np.where(p[:, :1] < 0, at_eye[1], at_eye[0])
 
 
-def eye_size(p: np.ndarray) -> np.ndarray:
+def _about_eye(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] from the centre of the eye on the point's side, and [N] 1 on ball and lids, 0 beyond."""
     centre = np.stack(
         [EYE[0] * np.where(p[:, 0] < 0, -1, 1), np.full(len(p), EYE[1]), np.full(len(p), EYE[2])], -1
     )
     arm = p - centre
-    return EYE_SCALE * arm * smoothstep(38, 20, np.linalg.norm(arm, axis=1))[:, None]
+    return arm, smoothstep(38, 20, np.linalg.norm(arm, axis=1))
+
+
+def eye_size(p: np.ndarray, ball: np.ndarray) -> np.ndarray:
+    """[N, 3] the ball and its lids grow."""
+    arm, share = _about_eye(p)
+    return EYE_SCALE * arm * share[:, None]
+
+
+def eye_tilt(p: np.ndarray, ball: np.ndarray) -> np.ndarray:
+    """[N, 3] the lids turn about the gaze, outer corners up; the ball, round as it is, stays."""
+    arm, share = _about_eye(p)
+    angle = EYE_TILT * share * np.sign(p[:, 0]) * ~ball
+    return angle[:, None] * np.stack([-arm[:, 1], arm[:, 0], 0 * angle], -1)
 
 
 def identity_modes(mesh: Mesh, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """[S, V, 3] and [S, J, 3] mm, and the S names."""
-    ball = mesh.of("eye")
-    none = np.zeros(len(joints), bool)
-    modes = [carried(f, mesh.points, ball) for f in FIELDS.values()] + [eye_size(mesh.points)]
-    at_joints = [carried(f, joints, none) for f in FIELDS.values()] + [eye_size(joints)]
-    return np.stack(modes), np.stack(at_joints), (*FIELDS, "eye_size")
+    modes = {name: lambda p, ball, field=field: carried(field, p, ball) for name, field in FIELDS.items()}
+    modes |= {"eye_size": eye_size, "eye_tilt": eye_tilt}
+    ball, none = mesh.of("eye"), np.zeros(len(joints), bool)
+    on_mesh = [mode(mesh.points, ball) for mode in modes.values()]
+    return np.stack(on_mesh), np.stack([mode(joints, none) for mode in modes.values()]), tuple(modes)

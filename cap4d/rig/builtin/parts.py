@@ -16,15 +16,29 @@ MOUTH_HEIGHT = -53.5
 
 
 def grid_part(
-    name: str, points: np.ndarray, uv: np.ndarray, *, pole: bool = False, ring: bool = False, **marks
+    name: str,
+    points: np.ndarray,
+    uv: np.ndarray,
+    *,
+    pole: bool = False,
+    end_pole: bool = False,
+    ring: bool = False,
+    **marks,
 ) -> Part:
-    """A part of one grid [R, C, 3]; `pole`: its first row is one point; `ring`: its last column is its first."""
+    """A part of one grid [R, C, 3].
+
+    Args:
+        pole, end_pole: The first, the last row is one point.
+        ring: The last column is the first.
+    """
     rows, columns = points.shape[:2]
     ids = np.arange(rows * columns).reshape(rows, columns)
     if ring:
         ids[:, -1] = ids[:, 0]
     if pole:
         ids[0] = ids[0, 0]
+    if end_pole:
+        ids[-1] = ids[-1, 0]
     used = np.unique(ids)
     new = np.zeros(rows * columns, int)
     new[used] = np.arange(len(used))
@@ -170,8 +184,8 @@ def build_tongue() -> Part:
         -1,
     )
     points[:, [0, -1], 0] = 0
-    uv = np.stack([0.5 + 0.5 * phi / np.pi, 1 - s], -1)
-    return grid_part("tongue", points[:, ::-1][:, ::-1], uv, pole=True, tip=1 - s)
+    uv = np.stack([0.5 + 0.5 * phi / np.pi, s], -1)
+    return grid_part("tongue", points[::-1], uv[::-1], pole=True, end_pole=True, tip=1 - s[::-1])
 
 
 def build_ear() -> Part:
@@ -240,8 +254,8 @@ HAIRLINE = (
     ),
     *((95, 41), (107, 35), (116, 10), (124, -16), (140, -42), (160, -56), (180, -58)),
 )
-# By signed azimuth (positive to the person's left): how far it stands off the skull, mm. Combed from a parting
-# on the left.
+# By signed azimuth (positive to the person's left): how far it stands off the skull, mm. Combed from a
+# parting on the left.
 THICKNESS = (
     *((-180, 8), (-140, 9), (-110, 9), (-84, 6), (-66, 8), (-45, 14), (-22, 22), (0, 21)),
     *((16, 16), (30, 10), (50, 8), (70, 5.5), (84, 5), (110, 8), (140, 9), (180, 8)),

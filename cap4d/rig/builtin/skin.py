@@ -21,7 +21,7 @@ OUTER = 37.0  # deg; outer eye corner
 SPANS = ((0.0, CORNER, 17), (CORNER, OUTER, 20), (OUTER, 60.0, 12), (60.0, 120.0, 15), (120.0, 180.0, 8))
 CORNER_COLUMN, OUTER_COLUMN = 17, 37
 
-# Landmark lines: their name, the number of rows from the line above, and their height in mm at AZIMUTHS (deg).
+# Landmark lines: name, number of rows from the line above, and height in mm at AZIMUTHS (deg).
 AZIMUTHS = (0, 10, 16, 25, 31, 38, 48, 60, 80, 95, 112, 132, 150, 180)
 KEYS = (
     ("hidden", 0, (101, 100.3, 99.9, 99.3, 98.3, 93.8, 87.3, 72.7, 54, 52, 40, 0, -25, -32)),
