@@ -34,7 +34,6 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     Raises:
         ArgumentError, DataError: The avatar or what drives it is not sound.
     """
-    _clear(window)  # a window at once; reading the avatar takes a moment
     avatar = Avatar.load(path, deformer=options.deformer)
     clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
     avatar.check_rig(clip.rig_name)
@@ -123,12 +122,18 @@ class LivePlayer:
 
     def _count(self, wanted: tuple) -> None:
         if self.frames == 0:
-            self.avatar.stages.clear()  # the first frame loads what the others find loaded
+            self._start()
         self.shown = wanted
         self.frames += 1
         self.late += time.perf_counter() > self.clock.due()
         self.read_out.tick(time.perf_counter())
         self.window.ctx.gc()
+
+    def _start(self) -> None:
+        """Time counts from the first picture on, which loads what the others find loaded."""
+        self.avatar.stages.clear()
+        self.started = time.perf_counter()
+        self.clock.rewind(self.started)
 
     def _camera(self, index: int, frame: Frame) -> Camera:
         """The CPU draws the window's own units, however many pixels a display has to each."""
@@ -179,10 +184,3 @@ class ReadOut:
 
 def _recent_ms(seconds: Iterable[float]) -> float:
     return float(np.median(list(seconds)[-30:])) * 1e3
-
-
-def _clear(window: Window) -> None:
-    window.use()
-    window.ctx.clear(*WHITE, 1.0)
-    window.swap()
-    window.poll()

@@ -44,7 +44,6 @@ def play(options: Options) -> None:
 
 def play_in_window(avatar: Path, options: Options) -> bool:
     """False, and one line that says so, where there is no display."""
-    from cap4d.app.live import play_live
     from cap4d.app.window import DisplayUnavailableError, Window
 
     try:
@@ -53,6 +52,9 @@ def play_in_window(avatar: Path, options: Options) -> bool:
         log.info("%s; rendering offline instead", error)
         return False
     with window:
+        window.clear()  # what follows takes a moment
+        from cap4d.app.live import play_live
+
         play_live(avatar, options, window)
     return True
 

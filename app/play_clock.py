@@ -44,7 +44,7 @@ class PlayClock:
         self._shown = max(self._shown + frames, 0)
 
     def rewind(self, now: float) -> None:
-        """Back to the first frame."""
+        """Back to the first frame, which is shown."""
         self._shown = 0
         self._start_at(0, now)
 

@@ -95,6 +95,13 @@ class Window:
         self.ctx.scissor = None
         return size
 
+    def clear(self) -> None:
+        """Shows an empty window at once."""
+        self.use()
+        self.ctx.clear(1.0, 1.0, 1.0, 1.0)
+        self.swap()
+        self.poll()
+
     def swap(self) -> None:
         glfw.swap_buffers(self.handle)
 
