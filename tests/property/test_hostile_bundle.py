@@ -574,3 +574,40 @@ def test_damaged_entries_with_fitting_hashes_raise_nothing_but_data_errors(
         except DataError:
             refused += 1
     assert refused > 0
+
+
+# The command line ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["inspect", "render", "view"])
+@pytest.mark.parametrize("name", ["cut", "hash", "index", "nan", "external_data"])
+def test_commands_refuse_in_one_line_and_write_nothing(
+    name: str, command: str, sound: Path, tmp_path: Path, capfd: pytest.CaptureFixture
+) -> None:
+    """The issue's list of hostile files, as a user meets them."""
+    from cap4d.cli import main
+
+    forge, path = Forge(sound), tmp_path / "bad.cap4d"
+    if name == "hash":
+        forge.manifest["entries"][ONNX]["sha256"] = "0" * 64
+    elif name == "external_data":
+        forge.network(external)
+        forge.sign()
+    elif name in ("index", "nan"):
+        tensor, value = ("binding", 60_000) if name == "index" else ("sh", np.nan)
+        forge.tensors(*at(GAUSSIANS, tensor, 0, value))
+        forge.sign()
+    forge.write(path)
+    if name == "cut":
+        path.write_bytes(path.read_bytes()[:-100])
+    output = str(tmp_path / "out.mp4")
+    if command == "view":
+        view = pytest.importorskip("cap4d.app.main").main
+        code = view([str(path), "--headless", "--backend", "cpu", "--out", output])
+    else:
+        code = main([command, str(path), *(["-o", output] if command == "render" else [])])
+    captured = capfd.readouterr()
+    lines = (captured.out + captured.err).strip().splitlines()
+    assert code == 1 and len(lines) == 1, lines
+    assert f"{path}" in lines[0] and ": expected " in lines[0] and ", found " in lines[0]
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.cap4d"]
