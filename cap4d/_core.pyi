@@ -99,7 +99,7 @@ def rasterize_vjp(
     v_depth: _F32 | None,
     threads: int = 0,
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
-    """Gradients of means, quats, scales, opacities, sh, means2d from all that went into and out of `rasterize`."""
+    """Gradients of means, quats, scales, opacities, sh and means2d."""
 
 def isa() -> Literal["base", "v3", "v4"]:
     """The x86-64 level of the inner loops in use (CAP4D_ISA asks for a lower one)."""

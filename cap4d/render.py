@@ -34,9 +34,9 @@ def render(
 ) -> Rendered:
     """Splats Gaussians (Kerbl et al. 2023) with the tiled C++ renderer.
 
-    EWA projection with a low-pass of 0.3 px^2; alpha = min(0.99, opacity * density); contributions below 1/255
-    are skipped; a pixel ends before its transmittance would fall below 1e-4. A Gaussian with a non-finite field is
-    not drawn. The picture has the same bits for any number of threads.
+    EWA projection with a low-pass of 0.3 px^2; alpha = min(0.99, opacity * density); contributions
+    below 1/255 are skipped; a pixel ends before its transmittance would fall below 1e-4. A Gaussian with
+    a non-finite field is not drawn. The picture has the same bits for any number of threads.
 
     Args:
         gaussians: N Gaussians in world space, m.

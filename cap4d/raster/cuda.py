@@ -1,4 +1,4 @@
-"""gsplat (Ye et al. 2024) behind the same call, for CUDA tensors. Not a dependency: install it where there is a GPU."""
+"""gsplat (Ye et al. 2024) behind the same call, for CUDA tensors. Not a dependency of the package."""
 
 from __future__ import annotations
 

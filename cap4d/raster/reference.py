@@ -1,4 +1,4 @@
-"""Splatting as one reads it: float64, every Gaussian at every pixel, gradients by autograd. For small pictures.
+"""Splatting as one reads it: float64, every Gaussian at every pixel, autograd. For small pictures.
 
 The stages have the names and the order of src/cpp: `project`, `eval_sh`, `composite`.
 """
@@ -61,10 +61,10 @@ def rasterize_reference(
     """`rasterize`, readable. The arguments are those of `rasterize`, checked; computes and returns float64.
 
     Args:
-        smooth_cutoff: 0 is the real thing: contributions below 1/255 are skipped, a pixel ends at transmittance
-            1e-4 and alpha is clamped at 0.99. Positive: a twin without steps and kinks for finite differences, in
-            which contributions fade in around 1/255 over this share of it, pixels never end, and alpha is 0.99
-            times the opacity times the density.
+        smooth_cutoff: 0 is the real thing: contributions below 1/255 are skipped, a pixel ends at
+            transmittance 1e-4 and alpha is clamped at 0.99. Positive: a twin without steps and kinks for
+            finite differences, in which contributions fade in around 1/255 over this share of it, pixels
+            never end, and alpha is 0.99 times the opacity times the density.
     """
     gaussians = tuple(x.double() for x in (means, quats, scales, opacities, sh))
     colors = eval_sh(gaussians[4], gaussians[0] - gaussians[0].new_tensor(camera.position), sh_degree)

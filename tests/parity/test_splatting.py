@@ -1,4 +1,4 @@
-"""The C++ renderer against the readable reference: pictures and gradients, on every instruction set at hand."""
+"""The C++ renderer against the readable reference: pictures and gradients, on each instruction set."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ EXTREME = [0.0, -0.0, 1e-45, 1e-38, -1e-20, 1e-12, 1e12, -1e20, 3e38]
     whole=st.booleans(),
 )
 def test_no_number_spreads(field: str, at: int, value: float, whole: bool) -> None:
-    """One bad number leaves picture and gradients finite; a non-finite one takes only its own Gaussian away."""
+    """One bad number leaves picture and gradients finite; a non-finite one takes only its Gaussian."""
     gaussians, camera = cloud(20), view(33, 29)
     arrays = {name: getattr(gaussians, name).copy() for name in FIELDS}
     victim = at % 20
