@@ -6,15 +6,19 @@ A driver is chosen when its library is loaded, so each one gets a process: `pyth
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from cap4d import _core
 from cap4d.bind import bind_fast
-from cap4d.camera import Camera, orbit_camera
+from cap4d.camera import Camera, opencv_from_rig, orbit_camera
 from cap4d.gaussians import Gaussians
 from cap4d.player.avatar import Avatar
 from cap4d.render import render
+from cap4d.rig.builtin import build_head
+from cap4d.rig.grid import build_grid, remesh
 
 from tiny_bundle import tiny_bundle
 
@@ -81,33 +85,84 @@ def degenerate(scene: Scene) -> Scene:
     return replace(scene, vertices=vertices)
 
 
-def scenes() -> dict[str, Scene]:
-    """By name. What a name starts with says what may go wrong there."""
-    rng = np.random.default_rng(5)
-    plain = ball(view())
-    n = len(plain.means)
-    dark = np.full_like(plain.sh, 0)
+def head(camera: Camera) -> Scene:
+    """The built-in head, smiling with open mouth: two Gaussians on every triangle, in its own colours."""
+    rig = build_head()
+    grid = build_grid(rig)
+    on_grid = remesh(rig, grid)
+    expr = np.zeros(rig.n_expressions, np.float32)
+    expr[[rig.expression_names.index(name) for name in ("mouthSmileLeft", "mouthSmileRight", "jawOpen")]] = (
+        0.5
+    )
+    binding = np.repeat(np.arange(len(grid.faces), dtype=np.int32), 2)
+    rng, n = np.random.default_rng(1), len(binding)
+    colors = on_grid.colors[grid.faces[binding]].mean(1)
+    return Scene(
+        vertices=opencv_from_rig(on_grid.subject().pose(expr)).astype(np.float32),
+        faces=grid.faces,
+        means=rng.uniform(-0.4, 0.4, (n, 3)).astype(np.float32) * np.float32([1, 0.1, 1]),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        log_scales=np.tile(np.log(np.float32([0.5, 0.1, 0.5])), (n, 1)),
+        opacity_logits=rng.uniform(0, 3, n).astype(np.float32),
+        sh=((colors - 0.5) / 0.28209479177387814).astype(np.float32)[:, None],
+        binding=binding,
+        camera=camera,
+    )
+
+
+def plain() -> Scene:
+    return ball(view())
+
+
+def opaque() -> Scene:
+    """Black and solid: what is behind a pixel's last Gaussian shows as much as it can."""
+    scene = plain()
+    dark = np.zeros_like(scene.sh)
     dark[:, 0] = -0.45 / 0.28209479177387814
-    odd_quats = plain.quats * rng.choice([1e-12, 1e-3, 1, 50], (n, 1)).astype(np.float32)
-    odd_quats[::17] = 0
-    needles = plain.log_scales + np.float32([2.2, -3.5, -3.5])
-    return {
-        **{f"degree {degree}": ball(view(30, -15), sh_degree=degree, index=degree) for degree in range(4)},
-        "side": ball(view(95, 10, width=200, height=120), index=3),
-        "behind": ball(view(180, -30, width=97, height=131), index=4),
-        "near": ball(view(20, 5, 0.16), index=5),
-        "inside": ball(view(180, 0, 0.02)),
-        "far": ball(view(0, 0, 9.0), index=6),
-        "one pixel": ball(view(width=1, height=1)),
-        "off centre": replace(plain, camera=view().cropped(70, -30, 120, 150)),
-        "thousands": ball(view(-25, 12, 0.5, 224, 224), 48, sh_degree=3, gaussians=2, index=7),
-        "opaque": replace(plain, opacity_logits=np.full(n, 12, np.float32), sh=dark),
-        "faint": replace(plain, opacity_logits=np.full(n, -4.5, np.float32)),
-        "needles": replace(plain, log_scales=needles),
-        "blobs": replace(plain, log_scales=plain.log_scales + np.float32(2)),
-        "odd quaternions": replace(plain, quats=odd_quats),
-        "degenerate": degenerate(plain),
-    }
+    return replace(scene, opacity_logits=np.full(len(dark), 12, np.float32), sh=dark)
+
+
+def faint() -> Scene:
+    """Opacities of 0.011, three times what is visible at all."""
+    return replace(plain(), opacity_logits=np.full(len(plain().means), -4.5, np.float32))
+
+
+def odd_quaternions() -> Scene:
+    """Of all lengths, and none."""
+    quats = plain().quats * np.random.default_rng(5).choice([1e-11, 1e-3, 1, 50], (len(plain().quats), 1))
+    quats[::17] = 0
+    return replace(plain(), quats=quats.astype(np.float32))
+
+
+def scaled(factors: list[float]) -> Scene:
+    return replace(plain(), log_scales=plain().log_scales + np.log(factors).astype(np.float32))
+
+
+# By name; what a name starts with says what may go wrong there.
+SCENES: dict[str, Callable[[], Scene]] = {
+    **{f"degree {d}": lambda d=d: ball(view(30, -15), sh_degree=d, index=d) for d in range(4)},
+    "side": lambda: ball(view(95, 10, width=200, height=120), index=3),
+    "behind": lambda: ball(view(180, -30, width=97, height=131), index=4),
+    "near": lambda: ball(view(20, 5, 0.16), index=5),
+    "inside": lambda: ball(view(180, 0, 0.02)),
+    "far": lambda: ball(view(0, 0, 9.0), index=6),
+    "one pixel": lambda: ball(view(width=1, height=1)),
+    "off centre": lambda: replace(plain(), camera=view().cropped(70, -30, 120, 150)),
+    "thousands": lambda: ball(view(-25, 12, 0.5, 224, 224), 48, sh_degree=3, gaussians=2, index=7),
+    "head": lambda: head(view(0, 0, 0.9, 256, 256)),
+    "head from the side": lambda: head(view(-60, 10, 0.9, 256, 256)),
+    "opaque": opaque,
+    "faint": faint,
+    "needles": lambda: scaled([9, 0.03, 0.03]),
+    "blobs": lambda: scaled([7, 7, 7]),
+    "odd quaternions": odd_quaternions,
+    "degenerate": lambda: degenerate(plain()),
+}
+
+
+@cache
+def scene(name: str) -> Scene:
+    return SCENES[name]()
 
 
 def draw_on_gl(output: str) -> None:
@@ -133,13 +188,14 @@ def draw_on_gl(output: str) -> None:
         splats.draw(scene.vertices, order, scene.camera)
         return splats.read()
 
-    for name, scene in scenes().items():
-        pictures[name] = draw(scene)
-    pictures["half thousands"] = draw(scenes()["thousands"], "f2")
+    for name in SCENES:
+        pictures[name] = draw(scene(name))
+    pictures["half thousands"] = draw(scene("thousands"), "f2")
     nothing = {
-        n: getattr(scene, n)[:0] for n in ("means", "quats", "log_scales", "opacity_logits", "sh", "binding")
+        n: getattr(plain(), n)[:0]
+        for n in ("means", "quats", "log_scales", "opacity_logits", "sh", "binding")
     }
-    pictures["empty"] = draw(replace(scene, **nothing))
+    pictures["empty"] = draw(replace(plain(), **nothing))
     avatar = Avatar(tiny_bundle(24, sh_degree=2, network=False))
     renderer = GlRenderer(ctx, avatar)
     for index, camera in enumerate(avatar_views()):

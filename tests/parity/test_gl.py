@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cap4d.app.splat_pass import render_constants
 from cap4d.player.avatar import Avatar
-from gl_scenes import NO_DRIVER, avatar_views, scenes
+from gl_scenes import NO_DRIVER, SCENES, avatar_views, scene
 
 from tiny_bundle import tiny_bundle
 
@@ -65,9 +65,9 @@ def psnr(a: np.ndarray, b: np.ndarray, peak: float = 1.0) -> float:
     return float(10 * np.log10(peak**2 / max(error, 1e-12)))
 
 
-@pytest.mark.parametrize("name", [*scenes(), "half thousands"])
+@pytest.mark.parametrize("name", [*SCENES, "half thousands"])
 def test_a_scene_looks_the_same(name, pictures):
-    expected = scenes()[name.removeprefix("half ")].on_cpu()
+    expected = scene(name.removeprefix("half ")).on_cpu()
     least, most = TOLERANCE.get(name.split()[0], TOLERANCE["default"])
     found = pictures[name]
     assert found.shape == expected.shape
@@ -77,8 +77,8 @@ def test_a_scene_looks_the_same(name, pictures):
 
 def test_the_scenes_show_something():
     """Else every renderer that draws nothing would pass."""
-    for name, scene in scenes().items():
-        picture = scene.on_cpu()
+    for name in SCENES:
+        picture = scene(name).on_cpu()
         assert picture[..., 3].max() > 0.015, name
         assert name == "one pixel" or on_white(picture).std() > 0.002, name
 
