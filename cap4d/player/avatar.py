@@ -121,8 +121,8 @@ class Avatar:
         vertices = self.vertices(expr, eye_rot=eye_rot, neck_rot=neck_rot, jaw_rot=jaw_rot)
         with self.stages.time("bind"):
             local = {name: getattr(bundle, name) for name in ("means", "quats", "log_scales", "binding")}
-            means, quats, scales = bind_fast(vertices, bundle.grid.faces, **local)
-        return Gaussians(means, quats, scales, self._opacities, bundle.sh)
+            posed = bind_fast(vertices, bundle.grid.faces, **local, threads=self.threads)
+        return Gaussians(*posed, self._opacities, bundle.sh)
 
     def render(
         self,
