@@ -24,8 +24,8 @@ class Rasterized:
         rgb: [H, W, 3] composited on the background (premultiplied by alpha without one).
         alpha: [H, W] coverage.
         depth: [H, W] expected depth, m; 0 where alpha is 0.
-        means2d: [N, 2] image positions, px (0 where not drawn). After `backward`, its `.grad` is dL/d(position),
-            which densification reads. Nothing flows back through the values themselves.
+        means2d: [N, 2] image positions, px (0 where not drawn). After `backward`, its `.grad` is
+            dL/d(position), which densification reads. Nothing flows back through the values themselves.
         radii: int32[N] three standard deviations, px, rounded up; 0 for a Gaussian that is not drawn.
     """
 

@@ -24,8 +24,12 @@ const Kernels& choose() {
   const char* wish = std::getenv("CAP4D_ISA");
   const bool no_v4 = wish && std::strcmp(wish, "v4") != 0, no_v3 = no_v4 && std::strcmp(wish, "v3") != 0;
   __builtin_cpu_init();
-  if (!no_v4 && __builtin_cpu_supports("x86-64-v4")) return v4::kKernels;
-  if (!no_v3 && __builtin_cpu_supports("x86-64-v3")) return v3::kKernels;
+  // By feature: GCC 11 does not know the levels by name. What else a level holds came with these.
+  const bool v3_runs = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");
+  const bool v4_runs = v3_runs && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+                       __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl");
+  if (v4_runs && !no_v4) return v4::kKernels;
+  if (v3_runs && !no_v3) return v3::kKernels;
 #endif
   return base::kKernels;
 }

@@ -136,10 +136,16 @@ CAP4D_INLINE Float4 fold4(FloatV v) {
 
 // Four sums at once: [sum a, sum b, sum c, sum d].
 CAP4D_INLINE Float4 sums4(Float4 a, Float4 b, Float4 c, Float4 d) {
+#ifdef __clang__
+#define CAP4D_SHUFFLE(x, y, i, j, k, l) __builtin_shufflevector(x, y, i, j, k, l)
+#else
   typedef std::int32_t Int4 __attribute__((vector_size(16)));
-  const Float4 ab = __builtin_shuffle(a, b, Int4{0, 4, 1, 5}) + __builtin_shuffle(a, b, Int4{2, 6, 3, 7});
-  const Float4 cd = __builtin_shuffle(c, d, Int4{0, 4, 1, 5}) + __builtin_shuffle(c, d, Int4{2, 6, 3, 7});
-  return __builtin_shuffle(ab, cd, Int4{0, 1, 4, 5}) + __builtin_shuffle(ab, cd, Int4{2, 3, 6, 7});
+#define CAP4D_SHUFFLE(x, y, i, j, k, l) __builtin_shuffle(x, y, Int4{i, j, k, l})
+#endif
+  const Float4 ab = CAP4D_SHUFFLE(a, b, 0, 4, 1, 5) + CAP4D_SHUFFLE(a, b, 2, 6, 3, 7);
+  const Float4 cd = CAP4D_SHUFFLE(c, d, 0, 4, 1, 5) + CAP4D_SHUFFLE(c, d, 2, 6, 3, 7);
+  return CAP4D_SHUFFLE(ab, cd, 0, 1, 4, 5) + CAP4D_SHUFFLE(ab, cd, 2, 3, 6, 7);
+#undef CAP4D_SHUFFLE
 }
 
 // The same operations on one number.

@@ -2,7 +2,7 @@
 
     python -m pytest -m bench -s tests/bench/bench_splatting.py
 
-Milliseconds are the least of several runs on all cores. The picture is checked against the float64 reference in a window.
+Milliseconds are the least of several runs on all cores. A window is checked against the float64 reference.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-
 from cap4d import _core
 from cap4d.camera import Camera
 from cap4d.gaussians import Gaussians
@@ -75,10 +74,9 @@ def test_splatting(maker: ModuleType, name: str) -> None:
     play = least_ms(lambda: _core.render(*fields, *where))
     train = least_ms(lambda: _core.rasterize(*fields, *where))
     back = least_ms(lambda: _core.rasterize_vjp(rendered, *fields, -1, *image, v_rgb, None, None))
-    print(
-        f"\n{name:10s} {_core.isa()}, {_core.default_threads()} threads, {rendered.pairs} pairs: play {play:.1f} ms, "
-        f"train forward {train:.1f} + backward {back:.1f} = {train + back:.1f} ms"
-    )
+    machine = f"{_core.isa()}, {_core.default_threads()} threads"
+    print(f"\n{name:10s} {machine}, {rendered.pairs} pairs: play {play:.1f} ms", end=", ")
+    print(f"train forward {train:.1f} + backward {back:.1f} = {train + back:.1f} ms")
     middle = camera.width // 2 - WINDOW // 2
     window = camera.cropped(middle, middle, WINDOW, WINDOW)
     near = np.abs(camera.project(gaussians.means)[:, :2] - camera.width / 2).max(1) < WINDOW * 1.5
