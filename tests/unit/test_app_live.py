@@ -237,6 +237,8 @@ def test_a_real_window_opens_plays_and_closes(backend, tmp_path):
     environment = os.environ | {"PYTHONPATH": str(HERE.parent), "LIBGL_ALWAYS_SOFTWARE": "1"}
     run = ["xvfb-run", "-a", *program]
     done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    if "window: expected OpenGL 4.1" in done.stderr:
+        pytest.skip("the X server has no OpenGL 4.1")
     assert done.returncode == 0, done.stderr
     picture = np.load(tmp_path / "last.npy")
     assert picture.shape == (160, 200, 3)
