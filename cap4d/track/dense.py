@@ -87,11 +87,13 @@ def refine(
         lambda a: torch.as_tensor(np.asarray(a), dtype=torch.float32)
     )
     valid = np.flatnonzero(observations.valid)
-    scale = min(1.0, FACE_SIZE / np.median(observations.face_sizes))
+    face = float(np.median(observations.face_sizes))
+    scale = min(1.0, FACE_SIZE / face)
+    unit = scale * face / FACE_SIZE  # px of the pictures per px of a 300 px face
     lightness = np.stack([_lightness(image(t), scale) for t in valid])
     x = problem.variables(solution)
     for blur, iterations in ROUNDS:
-        pictures = torch.as_tensor(np.stack([normalised(picture, blur) for picture in lightness]))[:, None]
+        pictures = torch.as_tensor(np.stack([normalised(picture, blur * unit, CONTEXT * unit) for picture in lightness]))[:, None]
         term = _SkinTerm(skin, pictures, problem, torch.as_tensor(valid), scale)
         before = term.spread(x)
         problem.more_evidence = term
@@ -156,12 +158,12 @@ class _SkinTerm:
         return seen - seen.mean(0)
 
 
-def normalised(lightness: np.ndarray, blur: float) -> np.ndarray:
-    """float32[H, W]: lightness, blurred, relative to the mean and the contrast of its surroundings."""
+def normalised(lightness: np.ndarray, blur: float, context: float) -> np.ndarray:
+    """float32[H, W]: lightness, blurred, relative to the mean and the contrast within `context` px."""
     smooth = cv2.GaussianBlur(lightness, (0, 0), blur)
-    mean = cv2.GaussianBlur(smooth, (0, 0), CONTEXT)
+    mean = cv2.GaussianBlur(smooth, (0, 0), context)
     difference = smooth - mean
-    contrast = cv2.GaussianBlur(difference * difference, (0, 0), CONTEXT)
+    contrast = cv2.GaussianBlur(difference * difference, (0, 0), context)
     return difference / np.sqrt(contrast + CONTRAST_FLOOR**2)
 
 

@@ -31,6 +31,8 @@ OVAL = (
     *(152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),
 )
 """The face's outline: it slides over the surface as the head turns, so it says little."""
+CHIN = (148, 152, 377, 176, 400)
+"""The part of the outline that shows how far the jaw is open."""
 FEATURES = (
     *(33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246),  # right lids
     *(263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466),  # left lids
@@ -138,7 +140,7 @@ class Weights:
     """What the solver believes, as weights on squares of standard-deviation-like units.
 
     Args:
-        feature, plain, outline, iris: Of landmarks.
+        feature, plain, outline, chin, iris: Of landmarks.
         gap: Of the opening of lids and lips.
         outlier: px (of a 300 px face) beyond which residuals count linearly.
         shape: Of identity coefficients, per frame.
@@ -153,12 +155,13 @@ class Weights:
     feature: float = 0.5
     plain: float = 0.15
     outline: float = 0.02
+    chin: float = 0.3
     iris: float = 2.0
     gap: float = 1.0
     outlier: float = 3.0
     shape: float = 0.5
-    expr: float = 4.0
-    sparse: float = 1.0
+    expr: float = 2.0
+    sparse: float = 8.0
     range: float = 2000.0
     gaze: float = 5.0
     roll: float = 1000.0
@@ -188,6 +191,7 @@ def landmark_weights(weights: Weights, known: np.ndarray | None = None) -> np.nd
     w = np.full(N_LANDMARKS, weights.plain)
     w[list(FEATURES)] = weights.feature
     w[list(OVAL)] = weights.outline
+    w[list(CHIN)] = weights.chin
     w[IRIS["right"] :] = 0
     w[list(IRIS.values())] = weights.iris
     return w if known is None else w * known
