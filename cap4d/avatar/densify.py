@@ -90,21 +90,21 @@ def densify(
     *,
     face_sizes: torch.Tensor,
     step: int,
+    room: int,
     per_face: int,
     generator: torch.Generator,
 ) -> None:
     """One round: clone small and split large Gaussians that views pull at, prune faint and huge ones.
 
-    When more ask to be refined than `settings.most` allows, those with the largest gradients are.
-
     Args:
         evidence: Since the last round.
+        room: How many more Gaussians there may be after this round; those with the largest gradients are refined.
         face_sizes: [M] m (fact 27), which turn local scales into world scales.
         per_face: Triangles keep at least one Gaussian if this is at least 1 (fact 30).
     """
     n = len(rows.model)
     world = rows.model.gaussians["log_scales"].detach().exp().amax(1) * face_sizes[rows.model.binding]
-    chosen = _most_wanted(evidence.mean_gradient(), settings.gradient, settings.most - n)
+    chosen = _most_wanted(evidence.mean_gradient(), settings.gradient, room)
     split = chosen & (world > settings.split_scale)
     _clone(rows, chosen & ~split)
     _split(rows, split, face_sizes, generator)

@@ -43,7 +43,7 @@ class Densify:
     Args:
         start, stop, every: First and last step, and the period.
         gradient: Mean norm of dL/d(means2d) per view, px^-1, above which a Gaussian is refined.
-        most: Gaussians the avatar may grow to.
+        most: Gaussians the avatar may grow to, by as many in every round.
         split_scale: World scale, m, above which a Gaussian is split instead of cloned.
         prune_opacity: Opacity below which a Gaussian goes.
         prune_big_after: Step from which too large Gaussians go as well.

@@ -129,12 +129,19 @@ class Trainer:
                 d,
                 face_sizes=self.face_sizes,
                 step=self.step,
+                room=self._room(),
                 per_face=self.preset.per_face,
                 generator=generator,
             )
             self.evidence = Evidence(len(self.model))
         if d.reset_every and self.step % d.reset_every == 0 and self.step <= d.stop:
             reset_opacity(self.rows)
+
+    def _room(self) -> int:
+        """An even share of the growth that is left: early rounds know least about where detail is missing."""
+        d = self.preset.densify
+        rounds = (d.stop - self.step) // d.every + 1
+        return math.ceil((d.most - len(self.model)) / rounds)
 
     def _view_index(self) -> int:
         """Every view once per epoch, in an order that depends on nothing but seed and epoch."""

@@ -28,11 +28,13 @@ def table():
     return Rows(model, optimizer), model.binding.clone()
 
 
-def run(rows, evidence, settings, per_face=1):
+def run(rows, evidence, settings, per_face=1, room=1000):
     faces = len(rows.model.faces)
     sizes = torch.full((faces,), 0.01)
     generator = torch.Generator().manual_seed(0)
-    densify(rows, evidence, settings, face_sizes=sizes, step=50, per_face=per_face, generator=generator)
+    densify(
+        rows, evidence, settings, face_sizes=sizes, step=50, room=room, per_face=per_face, generator=generator
+    )
 
 
 def check_alignment(rows, first_binding, fresh):
@@ -88,11 +90,10 @@ def test_splitting_replaces_the_parent_by_two_smaller_ones(table):
 
 def test_the_budget_takes_the_most_wanted(table):
     rows, binding = table
-    n = len(rows.model)
-    evidence = Evidence(n)
+    evidence = Evidence(len(rows.model))
     evidence.seen += 1
     evidence.gradient[:20] = torch.arange(20.0) + 2
-    run(rows, evidence, replace(SETTINGS, most=n + 3))
+    run(rows, evidence, SETTINGS, room=3)
     assert sorted(rows.model.gaussians["sh_dc"][-3:, 0, 0].tolist()) == [17, 18, 19]
     check_alignment(rows, binding, fresh=3)
 
