@@ -51,7 +51,7 @@ def synthesize(
     Args:
         rig: Any rig; drawn in its colours, or in one skin colour.
         output: The capture's folder, made if need be.
-        views: Cameras; from the third on every fourth sees the head from behind, in a quarter of the frames.
+        views: Cameras; every fourth one sees the head from behind, in a quarter of the frames.
         frames: The first one is neutral.
         size: Pixels a side.
         seed: Same seed, same capture.
@@ -61,13 +61,13 @@ def synthesize(
     for name, value in (("views", views), ("frames", frames), ("size", size)):
         if value < 1:
             raise ArgumentError(f"{name}: expected at least 1, got {value}")
-    rng = np.random.default_rng(seed)
+    output, rng = Path(output), np.random.default_rng(seed)
     subject = rig.subject()
     cameras, behind = _cameras(views, size, rng)
     performance = _perform(rig, frames, rng)
     valid = np.ones((views, frames), bool)
     valid[behind] = np.arange(frames) % 4 == 0
-    _save(rig, Path(output), cameras, performance, valid)
+    _save(rig, output, cameras, performance, valid)
     for t in range(frames):
         vertices = head_vertices(subject, performance, t)
         shades = _shades(rig, vertices)
@@ -217,7 +217,9 @@ def _draw(
     """Straight sRGB [H, W, 3] and coverage [H, W] of the mesh."""
     n = SUPERSAMPLE
     fragments = rasterize_mesh(vertices, faces, camera.resized(camera.width * n, camera.height * n))
-    lit = fragments.interpolate(shades, faces)
+    lit = np.zeros((*fragments.face.shape, 3))
+    corners = shades[faces[fragments.face[fragments.hit]]]
+    lit[fragments.hit] = np.einsum("pk,pkc->pc", fragments.bary[fragments.hit], corners)
     boxes = (camera.height, n, camera.width, n)
     matte = fragments.hit.reshape(boxes).mean((1, 3))
     rgb = lit.reshape(*boxes, 3).mean((1, 3)) / np.maximum(matte, 1e-6)[..., None]

@@ -52,18 +52,18 @@ FIELDS: dict[str, Field] = {
     "chin_forward": lambda p: _along(0, 0, 1, 3.2 * _near(p, (0, -90, 76), (26, 22, 34))),
     "nose_size": lambda p: (p - [0, -8, 82]) * (0.11 * _near(p, (0, -12, 95), (17, 24, 22)))[:, None],
     "nose_length": lambda p: _along(0, -1, 0.3, 2.6 * _near(p, (0, -22, 98), (14, 16, 20))),
-    "nose_width": lambda p: _along(_side(p), 0, 0, 1.7 * _near(p, (11, -22, 90), (9, 11, 14))),
+    "nose_width": lambda p: _along(_side(p), 0, 0, 2.6 * _near(p, (13, -22, 90), (9, 11, 14))),
     "nose_bridge": lambda p: _along(0, 0, 1, 2.3 * _near(p, (0, 10, 90), (8, 17, 18))),
     "nose_tip_up": lambda p: _along(0, 1, 0.2, 2.2 * _near(p, (0, -17, 108), (12, 10, 14))),
     "eye_spacing": lambda p: _along(_side(p), 0, 0, 1.7 * _near(p, (32, 20, 66), (24, 20, 30))),
     "eye_height": lambda p: _along(0, 1, 0, 2.0 * _near(p, (32, 22, 66), (28, 22, 34))),
     "eye_depth": lambda p: _along(0, 0, -1, 1.6 * _near(p, (33, 22, 68), (24, 18, 30))),
-    "mouth_width": lambda p: _along(0.08 * p[:, 0], 0, 0, _near(p, (0, -54, 84), (38, 17, 34))),
+    "mouth_width": lambda p: _along(0.11 * p[:, 0], 0, 0, _near(p, (0, -54, 84), (38, 17, 34))),
     "mouth_height": lambda p: _along(0, 1, 0, 2.0 * _near(p, (0, -54, 84), (36, 17, 40))),
     "cheek_fullness": lambda p: _along(
         1.0 * _side(p), -0.1, 0.6, 3.2 * _near(p, (44, -38, 46), (22, 27, 30))
     ),
-    "cheekbones": lambda p: _along(0.8 * _side(p), 0.2, 0.7, 2.3 * _near(p, (48, -8, 52), (20, 15, 24))),
+    "cheekbones": lambda p: _along(0.8 * _side(p), 0.2, 0.7, 3.6 * _near(p, (50, -8, 52), (20, 16, 26))),
     "brow_ridge": lambda p: _along(0, -0.3, 1, 1.9 * _near(p, (22, 40, 80), (30, 9, 22))),
     "brow_height": lambda p: _along(0, 1, 0, 2.2 * _near(p, (28, 42, 78), (32, 9, 26))),
     "forehead_slope": lambda p: _along(0, 0, -1, 4.0 * smoothstep(42, 110, p[:, 1]) * _front(p)),
@@ -78,10 +78,10 @@ FIELDS: dict[str, Field] = {
         0.06 * p[:, 0],
         0,
         0.06 * (p[:, 2] + 35),
-        smoothstep(-75, -125, p[:, 1]) * smoothstep(-260, -180, p[:, 1]),
+        smoothstep(-75, -125, p[:, 1]) * smoothstep(-210, -160, p[:, 1]),
     ),
     "lip_fullness": lambda p: _along(
-        0, 0.16 * (p[:, 1] + 53.5), 1.3, _near(p, (0, -54, 90), (22, 10.5, 16)) * _front(p)
+        0, 0.2 * (p[:, 1] + 53.5), 1.9, _near(p, (0, -54, 90), (22, 10.5, 16)) * _front(p)
     ),
 }
 EYE_SCALE, EYE_TILT = 0.055, 0.08  # of the two modes about the eyeball's centre; the tilt in rad
@@ -107,10 +107,7 @@ def carried(field: Field, p: np.ndarray, ball: np.ndarray) -> np.ndarray:
 
 def _about_eye(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[N, 3] from the centre of the eye on the point's side, and [N] 1 on ball and lids, 0 beyond."""
-    centre = np.stack(
-        [EYE[0] * np.where(p[:, 0] < 0, -1, 1), np.full(len(p), EYE[1]), np.full(len(p), EYE[2])], -1
-    )
-    arm = p - centre
+    arm = p - _own_eye(p)
     return arm, smoothstep(38, 20, np.linalg.norm(arm, axis=1))
 
 

@@ -199,13 +199,13 @@ def build_ear() -> Part:
     behind = np.broadcast_to(back[:, None], r.shape)
     up, fore = np.cos(f), np.sin(f)
     tall = np.where(up > 0, 29.0, 31.0)
-    wide = np.where(fore > 0, 13.0, 19.0) * (1 + 0.18 * up - 0.12 * (up < 0) * up**2 * 2)
+    wide = np.where(fore > 0, 13.0, 19.0) * (1 + 0.16 * up - 0.06 * (up < 0) * up**2)
     b, a = tall * up * r, -wide * fore * r  # up and backward in the ear's plane
     lobe = smoothstep(-0.45, -0.95, np.cos(f) * np.minimum(r * 1.2, 1))
     face = smoothstep(0.2, 0.9, fore)
     bump = lambda c, w: np.exp(-(((r - c) / w) ** 2))  # noqa: E731
     height = (
-        -6.5 * smoothstep(0.52, 0.12, r)
+        -6.0 * smoothstep(0.52, 0.12, r)
         + 3.0 * bump(0.62, 0.12) * (1 - face)
         - 1.8 * bump(0.78, 0.07) * (1 - face)
     )
@@ -220,7 +220,7 @@ def build_ear() -> Part:
     outward = np.array([np.cos(tilt), 0.05, np.sin(tilt)])
     upward = np.array([0.10, 0.985, -0.14])
     points = (
-        np.array([75.5, 3.0, -9.0])
+        np.array([77.0, 3.0, -9.0])
         + a[..., None] * backward
         + b[..., None] * upward
         + height[..., None] * outward
@@ -238,28 +238,12 @@ def build_ear() -> Part:
 
 
 # By azimuth in degrees, for both sides: the hair's edge on the skin, mm.
-HAIRLINE = (
-    *(
-        (0, 85),
-        (12, 86),
-        (24, 87),
-        (34, 82),
-        (44, 70),
-        (53, 54),
-        (62, 40),
-        (69, 24),
-        (75, 7),
-        (80, 6),
-        (85, 28),
-    ),
-    *((95, 41), (107, 35), (116, 10), (124, -16), (140, -42), (160, -56), (180, -58)),
-)
+HAIRLINE_AT = (0, 12, 24, 34, 44, 53, 61, 67, 71, 74, 80, 83, 87, 95, 107, 116, 124, 140, 160, 180)
+HAIRLINE = (85, 86, 87, 82, 70, 54, 40, 24, 8, 4, 4, 16, 32, 41, 35, 10, -16, -42, -56, -58)
 # By signed azimuth (positive to the person's left): how far it stands off the skull, mm. Combed from a
 # parting on the left.
-THICKNESS = (
-    *((-180, 8), (-140, 9), (-110, 9), (-84, 6), (-66, 8), (-45, 14), (-22, 22), (0, 21)),
-    *((16, 16), (30, 10), (50, 8), (70, 5.5), (84, 5), (110, 8), (140, 9), (180, 8)),
-)
+THICKNESS_AT = (-180, -140, -110, -84, -66, -45, -22, 0, 16, 30, 50, 70, 84, 110, 140, 180)
+THICKNESS = (8, 9, 9, 6, 8, 14, 22, 21, 16, 10, 8, 5.5, 5, 8, 9, 8)
 
 
 def build_hair() -> Part:
@@ -282,7 +266,10 @@ def _hair_half(side: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarra
     angle = np.radians(theta)
     outward = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
     ends = smoothstep(0, 12, theta) * smoothstep(180, 165, theta)
-    line = curve(theta, list(HAIRLINE), soft=2.2) + 0.7 * np.sin(0.9 * theta * side) * ends
+    line = (
+        curve(theta, list(zip(HAIRLINE_AT, HAIRLINE, strict=True)), soft=2.2)
+        + 0.7 * np.sin(0.9 * theta * side) * ends
+    )
     edge = cast(np.stack([0 * line, line, 0 * line], -1), outward)
     centre = np.array([0, 40.0, -12.0])
     crown = np.array([0, 1.0, -0.42]) / np.hypot(1, 0.42)
@@ -295,7 +282,7 @@ def _hair_half(side: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarra
     rays = np.cos(turn)[..., None] * crown + np.sin(turn)[..., None] * across
     skull = cast(np.broadcast_to(centre, rays.shape).reshape(-1, 3), rays.reshape(-1, 3)).reshape(rays.shape)
     locks = strands(turn, side * angle)
-    thick = curve(side * theta, list(THICKNESS), soft=7.0)
+    thick = curve(side * theta, list(zip(THICKNESS_AT, THICKNESS, strict=True)), soft=7.0)
     thick = 12 + (thick - 12) * smoothstep(0.1, 0.75, s)[:, None]
     profile = (np.maximum(1 - s**8, 0) ** 0.6)[:, None]
     rise = profile * (thick * (0.95 + 0.1 * locks) + 3.4 * (locks - 0.5)) - 2.0 * s[:, None] ** 12

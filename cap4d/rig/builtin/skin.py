@@ -254,9 +254,9 @@ def pouch(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
 
 # Heights in the UV atlas of the bands between landmark lines and of the openings, in pixels of the 128-pixel
 # grid. The
-# rims of lids and lips lie on pixel centres (from the top: 22.5, 29.5, 54.5, 61.5), so that the grid has them
+# rims of lids and lips lie on pixel centres (from the top: 22.5, 29.5, 53.5, 60.5), so that the grid has them
 # as edges.
-BANDS = (0, 3.5, 5, 5, 4, 5, 0, 4, 11.5, 4.5, 5, 0, 5, 7, 4.5, 4.5, 4.5)
+BANDS = (0, 3.5, 5, 5, 4, 5, 0, 4, 10.5, 4.5, 5, 0, 5, 7, 4.5, 5.5, 4.5)
 EYE_HOLE, MOUTH_HOLE = 7.0, 7.0
 INSIDE_LID, INSIDE_LIP = (
     (0, 1.0, 1.5, 2.01),
