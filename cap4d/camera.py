@@ -12,7 +12,7 @@ from cap4d.rotation import Array, axis_angle_to_rotmat
 NEAR = 0.01  # m; the splatting renderers cull Gaussians whose centre is nearer (gsplat's default)
 
 OPENCV_FROM_RIG = np.diag([1.0, -1.0, -1.0])
-"""The rig keeps FLAME's axes (x to the person's left, y up, face to +z); the world of cameras has y down, z away (fact 10)."""
+"""Rigs keep FLAME's axes (x to the person's left, y up, face to +z); cameras have y down and z away (fact 10)."""
 
 
 def opencv_from_rig(points: Array) -> Array:
@@ -42,7 +42,9 @@ class Camera:
         if self.K.shape != (3, 3) or not np.isfinite(self.K).all():
             raise ArgumentError(f"K: expected finite float64[3, 3], got {self.K.dtype}{list(self.K.shape)}")
         if self.viewmat.shape != (4, 4) or not np.isfinite(self.viewmat).all():
-            raise ArgumentError(f"viewmat: expected finite float64[4, 4], got {self.viewmat.dtype}{list(self.viewmat.shape)}")
+            raise ArgumentError(
+                f"viewmat: expected finite float64[4, 4], got {self.viewmat.dtype}{list(self.viewmat.shape)}"
+            )
         if self.width < 1 or self.height < 1:
             raise ArgumentError(f"size: expected at least 1x1, got {self.width}x{self.height}")
 
@@ -85,9 +87,16 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def orbit_camera(
-    *, yaw_deg: float, pitch_deg: float, distance: float, target: np.ndarray, fov_y_deg: float, width: int, height: int
+    *,
+    yaw_deg: float,
+    pitch_deg: float,
+    distance: float,
+    target: np.ndarray,
+    fov_y_deg: float,
+    width: int,
+    height: int,
 ) -> Camera:
-    """A camera on a sphere around `target` (OpenCV world); yaw 0, pitch 0 looks at the face, positive pitch from above."""
+    """A camera on a sphere around `target` (OpenCV world): yaw 0 faces the face, positive pitch is from above."""
     yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
     away = np.array([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), -np.cos(yaw) * np.cos(pitch)])
     focal = 0.5 * height / np.tan(np.radians(fov_y_deg) / 2)

@@ -1,4 +1,4 @@
-"""The `cap4d` command line: one function per command, imports made lazily inside it. The device is chosen here only.
+"""The `cap4d` command line: one function per command, with its imports inside. The device is chosen here only.
 
 Exit codes: 0 success, 1 bad data (one line: file, field, expected, found), 2 a bad argument, 130 interrupted.
 """
@@ -69,7 +69,7 @@ def command(commands, name: str, run: Callable, help: str, example: str) -> argp
     return parser
 
 
-# demo ---------------------------------------------------------------------------------------------------------------
+# demo ---------------------------------------------------------------------------------------------
 
 
 def add_demo(commands) -> None:
@@ -80,10 +80,18 @@ def add_demo(commands) -> None:
         "build (once) and play an avatar: the built-in head, or one made from your video",
         "cap4d demo --video me.mp4 --rig ict.npz",
     )
-    parser.add_argument("--video", type=Path, help="make the avatar from this video instead of the built-in head")
-    parser.add_argument("--rig", type=Path, help="head model for --video (a rig .npz; default: the built-in head)")
-    parser.add_argument("--preset", default="low", choices=("debug", "low"), help="fit settings for --video (default: low)")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for what the demo writes (default: out)")
+    parser.add_argument(
+        "--video", type=Path, help="make the avatar from this video instead of the built-in head"
+    )
+    parser.add_argument(
+        "--rig", type=Path, help="head model for --video (a rig .npz; default: the built-in head)"
+    )
+    parser.add_argument(
+        "--preset", default="low", choices=("debug", "low"), help="fit settings for --video (default: low)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out"), help="folder for what the demo writes (default: out)"
+    )
 
 
 def run_demo(arguments: argparse.Namespace) -> int:
@@ -97,7 +105,7 @@ def run_demo(arguments: argparse.Namespace) -> int:
     return demo.play(avatar, arguments.out)
 
 
-# rig ----------------------------------------------------------------------------------------------------------------
+# rig ----------------------------------------------------------------------------------------------
 
 
 def add_rig(commands) -> None:
@@ -114,7 +122,11 @@ def add_rig(commands) -> None:
         "cap4d rig import flame flame2023_no_jaw.pkl --assets cap4d/data/assets/flame -o flame.npz",
     )
     flame.add_argument("model", type=Path, metavar="MODEL.pkl")
-    flame.add_argument("--assets", type=Path, help="folder of the CAP4D assets (template, blink, jaw regressor, vertex lists)")
+    flame.add_argument(
+        "--assets",
+        type=Path,
+        help="folder of the CAP4D assets (template, blink, jaw regressor, vertex lists)",
+    )
     flame.add_argument(
         "--no-compat-pose-offset",
         dest="compat_pose_offset",
@@ -130,13 +142,25 @@ def add_rig(commands) -> None:
     )
     ict.add_argument("model", type=Path, metavar="FACEXMODEL")
     builtin = command(
-        kinds, "builtin", run_import_builtin, "the built-in head, which needs no file", "cap4d rig import builtin -o builtin.npz"
+        kinds,
+        "builtin",
+        run_import_builtin,
+        "the built-in head, which needs no file",
+        "cap4d rig import builtin -o builtin.npz",
     )
     for kind in (flame, ict, builtin):
         kind.add_argument("-o", "--output", type=Path, required=True, metavar="RIG.npz")
-    show = command(verbs, "show", run_show_rig, "draw a rig and each of its expressions", "cap4d rig show ict.npz -o ict.png")
+    show = command(
+        verbs,
+        "show",
+        run_show_rig,
+        "draw a rig and each of its expressions",
+        "cap4d rig show ict.npz -o ict.png",
+    )
     show.add_argument("rig", type=Path, metavar="RIG.npz")
-    show.add_argument("--on", type=Path, metavar="CAPTURE", help="draw it over the first photo of a capture instead")
+    show.add_argument(
+        "--on", type=Path, metavar="CAPTURE", help="draw it over the first photo of a capture instead"
+    )
     show.add_argument("-o", "--output", type=Path, help="PNG to write (default: beside the rig)")
 
 
@@ -195,7 +219,7 @@ def load_rig_or_builtin(path: Path | None):
     return build_head() if path is None else load_rig(path)
 
 
-# track, fit -----------------------------------------------------------------------------------------------------------
+# track, fit ---------------------------------------------------------------------------------------
 
 
 def add_track(commands) -> None:
@@ -206,9 +230,13 @@ def add_track(commands) -> None:
         "turn a video or a folder of photos into a capture",
         "cap4d track me.mp4 --rig ict.npz -o capture",
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="a video, an image, or a folder of images of one person")
+    parser.add_argument(
+        "input", type=Path, metavar="INPUT", help="a video, an image, or a folder of images of one person"
+    )
     parser.add_argument("--rig", type=Path, required=True, metavar="RIG.npz")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="CAPTURE", help="folder to write; must not exist")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="CAPTURE", help="folder to write; must not exist"
+    )
 
 
 def run_track(arguments: argparse.Namespace) -> None:
@@ -229,8 +257,12 @@ def add_fit(commands) -> None:
     parser.add_argument("captures", type=Path, nargs="+", metavar="CAPTURE")
     parser.add_argument("--rig", type=Path, required=True, metavar="RIG.npz")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="AVATAR.cap4d")
-    parser.add_argument("--preset", default="low", choices=("debug", "low"), help="debug: a minute; low: for CPUs, 256x256")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted fit")
+    parser.add_argument(
+        "--preset", default="low", choices=("debug", "low"), help="debug: a minute; low: for CPUs, 256x256"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the checkpoint of an interrupted fit"
+    )
     parser.add_argument("--ablate", choices=("unet",), help="leave a part out, to see what it is worth")
     parser.add_argument("--seed", type=int, default=0)
 
@@ -250,7 +282,7 @@ def run_fit(arguments: argparse.Namespace) -> None:
     )
 
 
-# render, inspect ------------------------------------------------------------------------------------------------------
+# render, inspect ----------------------------------------------------------------------------------
 
 
 def add_render(commands) -> None:
@@ -262,7 +294,9 @@ def add_render(commands) -> None:
         "cap4d render me.cap4d --drive fit.npz --camera orbit -o out.mp4",
     )
     parser.add_argument("avatar", type=Path, metavar="AVATAR.cap4d")
-    parser.add_argument("--drive", metavar="SRC", help="fit.npz or vertices .npy (default: the avatar's idle clip)")
+    parser.add_argument(
+        "--drive", metavar="SRC", help="fit.npz or vertices .npy (default: the avatar's idle clip)"
+    )
     parser.add_argument("--template", type=Path, help="neutral vertices of a .npy stream")
     parser.add_argument("--fps", type=float, help="rate of a source that does not say its own")
     parser.add_argument("--camera", default="static", metavar="static|orbit|FILE")
@@ -289,7 +323,9 @@ def run_render(arguments: argparse.Namespace) -> None:
 
 
 def add_inspect(commands) -> None:
-    parser = command(commands, "inspect", run_inspect, "say what is in a .cap4d file", "cap4d inspect me.cap4d")
+    parser = command(
+        commands, "inspect", run_inspect, "say what is in a .cap4d file", "cap4d inspect me.cap4d"
+    )
     parser.add_argument("avatar", type=Path, metavar="AVATAR.cap4d")
 
 

@@ -41,7 +41,9 @@ def build_demo_avatar(rig: HeadRig, path: Path) -> None:
         from cap4d.avatar.fit import fit
         from cap4d.synth.capture import synthesize
     except ImportError as error:
-        raise ArgumentError(f"the demo avatar is built once, which needs the extra cap4d[fit] ({error})") from error
+        raise ArgumentError(
+            f"the demo avatar is built once, which needs the extra cap4d[fit] ({error})"
+        ) from error
     log.info("building the demo avatar (once, a few minutes): %s", path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as folder:
@@ -51,7 +53,7 @@ def build_demo_avatar(rig: HeadRig, path: Path) -> None:
 
 
 def avatar_from_video(video: Path, rig: HeadRig, folder: Path, *, preset: str) -> Path:
-    """The whole road: video -> capture -> avatar, kept in `folder` and not made again while they are there."""
+    """The whole road: video -> capture -> avatar, kept in `folder` made once."""
     from cap4d.avatar.fit import fit
     from cap4d.track import track
 

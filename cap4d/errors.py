@@ -1,4 +1,4 @@
-"""The two ways a request can fail. Raised once, where the cause is known; the command line turns them into exit codes."""
+"""The two ways a request can fail. Raised where the cause is known; the command line makes exit codes of them."""
 
 from __future__ import annotations
 

@@ -20,7 +20,8 @@ class Gaussians:
         quats: float32[N, 4] wxyz; need not be unit.
         scales: float32[N, 3] standard deviations, m.
         opacities: float32[N] in [0, 1].
-        sh: float32[N, S, 3] real spherical harmonics, S = (degree + 1)^2, DC first; colour = 0.5 + sum, clamped at 0.
+        sh: float32[N, S, 3] spherical harmonics, S = (degree + 1)^2, DC first;
+            colour = 0.5 + sum, clamped at 0.
     Raises:
         ArgumentError: A field has the wrong shape or dtype.
     """
@@ -37,9 +38,17 @@ class Gaussians:
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value.dtype != np.float32 or value.shape != shape:
-                raise ArgumentError(f"{name}: expected float32{list(shape)}, got {value.dtype}{list(value.shape)}")
+                raise ArgumentError(
+                    f"{name}: expected float32{list(shape)}, got {value.dtype}{list(value.shape)}"
+                )
         sh = self.sh
-        if sh.dtype != np.float32 or sh.ndim != 3 or sh.shape[0] != n or sh.shape[1] not in SH_COUNTS or sh.shape[2] != 3:
+        if (
+            sh.dtype != np.float32
+            or sh.ndim != 3
+            or sh.shape[0] != n
+            or sh.shape[1] not in SH_COUNTS
+            or sh.shape[2] != 3
+        ):
             raise ArgumentError(f"sh: expected float32[{n}, 1|4|9|16, 3], got {sh.dtype}{list(sh.shape)}")
 
     def __len__(self) -> int:

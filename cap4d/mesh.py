@@ -17,7 +17,7 @@ MIN_DEPTH = 1e-3  # m; a triangle with a vertex nearer than this is not drawn
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """What each pixel sees: `face` int32[H, W] triangle or -1; `bary` float64[H, W, 3] perspective-correct barycentrics."""
+    """What each pixel sees: `face` int32[H, W], or -1; `bary` float64[H, W, 3], perspective-correct."""
 
     face: np.ndarray
     bary: np.ndarray
@@ -33,7 +33,9 @@ class Fragments:
         return (corners * self.bary[..., None]).sum(-2) * self.hit[..., None]
 
 
-def rasterize_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, cull_back: bool = False) -> Fragments:
+def rasterize_mesh(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, cull_back: bool = False
+) -> Fragments:
     """The nearest triangle per pixel.
 
     Args:
@@ -47,7 +49,7 @@ def rasterize_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, c
     xyz[~(np.abs(xyz).max(1) < 1e12) | (xyz[:, 2] < MIN_DEPTH)] = np.nan
     faces = np.ascontiguousarray(faces, np.int32)
     cull = "clockwise" if cull_back else "none"
-    # 1/z is linear in the image, so it is the depth that orders triangles exactly (negated: nearer is smaller).
+    # 1/z is linear in the image, so it orders triangles exactly (negated: nearer is smaller).
     inverse = xyz.copy()
     inverse[:, 2] = -1 / xyz[:, 2]
     face, bary = _core.rasterize_mesh(inverse, faces, camera.height, camera.width, cull)
@@ -58,7 +60,7 @@ def rasterize_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, c
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[V, 3] unit normals, the area-weighted mean of the triangles around each vertex (zero where there are none)."""
+    """[V, 3] unit normals, the area-weighted mean of the triangles around (zero where there are none)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     face_normals = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)
@@ -93,9 +95,14 @@ def shade(
     if colors is None:
         colors = np.full_like(np.asarray(vertices, np.float64), 0.8)
     view_to_world = camera.viewmat[:3, :3].T
-    key, fill = (view_to_world @ (d / np.linalg.norm(d)) for d in (np.array([-0.5, -0.8, -1.0]), np.array([0.8, -0.1, -0.8])))
+    key, fill = (
+        view_to_world @ (d / np.linalg.norm(d))
+        for d in (np.array([-0.5, -0.8, -1.0]), np.array([0.8, -0.1, -0.8]))
+    )
     normals = vertex_normals(np.asarray(vertices, np.float64), faces)
-    light = ambient + (1 - ambient) * (0.75 * np.maximum(normals @ key, 0) + 0.35 * np.maximum(normals @ fill, 0))
+    light = ambient + (1 - ambient) * (
+        0.75 * np.maximum(normals @ key, 0) + 0.35 * np.maximum(normals @ fill, 0)
+    )
     lit = fragments.interpolate(np.clip(colors * light[:, None], 0, 1), faces)
     rgba = np.concatenate([lit, fragments.hit[..., None]], -1)
     rgba = rgba.reshape(camera.height, supersample, camera.width, supersample, 4).mean((1, 3))

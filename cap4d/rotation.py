@@ -1,4 +1,4 @@
-"""Rotations as axis-angle, matrix and quaternion (wxyz). One set of functions for NumPy arrays and torch tensors."""
+"""Rotations as axis-angle, matrix and quaternion (wxyz). One set of functions for NumPy and torch."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ class Frame:
         rig_name: The rig whose expression space `expr` lives in.
         expr: float32[E].
         eye_rot, neck_rot, jaw_rot: float32[3] axis-angle, rad.
-        rot, tra: float32[3] the head's pose in the source's world, rig axes, rad and m; None: the source has none.
+        rot, tra: float32[3] the head's pose in the source's world, rig axes; None: it has none.
     """
 
     t: float
@@ -55,13 +55,17 @@ class Clip:
     def __post_init__(self) -> None:
         frames = len(self.expr)
         if frames < 1 or self.expr.ndim != 2:
-            raise ArgumentError(f"expr: expected float32[T, E] with T >= 1, got {self.expr.dtype}{list(self.expr.shape)}")
+            raise ArgumentError(
+                f"expr: expected float32[T, E] with T >= 1, got {self.expr.dtype}{list(self.expr.shape)}"
+            )
         if not self.fps > 0:
             raise ArgumentError(f"fps: expected a positive number, got {self.fps}")
         for name in ("eye_rot", "neck_rot", "jaw_rot", "rot", "tra"):
             value = getattr(self, name)
             if value is not None and value.shape != (frames, 3):
-                raise ArgumentError(f"{name}: expected float32[{frames}, 3], got {value.dtype}{list(value.shape)}")
+                raise ArgumentError(
+                    f"{name}: expected float32[{frames}, 3], got {value.dtype}{list(value.shape)}"
+                )
 
     def __len__(self) -> int:
         return len(self.expr)
@@ -74,7 +78,15 @@ class Clip:
     def frame(self, index: int) -> Frame:
         """Frame `index`; beyond the end the clip repeats."""
         i = index % len(self)
-        pose = {name: None if getattr(self, name) is None else getattr(self, name)[i] for name in ("rot", "tra")}
+        pose = {
+            name: None if getattr(self, name) is None else getattr(self, name)[i] for name in ("rot", "tra")
+        }
         return Frame(
-            index / self.fps, self.rig_name, self.expr[i], self.eye_rot[i], self.neck_rot[i], self.jaw_rot[i], **pose
+            index / self.fps,
+            self.rig_name,
+            self.expr[i],
+            self.eye_rot[i],
+            self.neck_rot[i],
+            self.jaw_rot[i],
+            **pose,
         )

@@ -1,8 +1,8 @@
 """One head model for all: a linear shape space, a linear expression space, and a few rotating joints.
 
-Blendshapes and linear blend skinning are written once here and serve NumPy arrays and torch tensors alike: every
-function takes what it is given. A rig may stand on any set of points that are barycentric mixtures of its mesh
-(`resample`): the whole mesh, tracked landmarks, or the UV grid. No file access here (see store.py).
+Blendshapes and linear blend skinning are written once here and serve NumPy arrays and torch tensors alike. A rig
+may stand on any points that are barycentric mixtures of its mesh (`resample`): the whole mesh, tracked landmarks,
+or the UV grid. No file access here (see store.py).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ JOINT_DRIVERS = ("neck", "jaw", "eyes", "expr")
 
 @dataclass(frozen=True, eq=False)
 class MouthPlacement:
-    """Where a rig's rigid mouth cavity sits on a subject: a frame from two anchors of the neutral shape (fact 12).
+    """Where a rig's rigid mouth cavity sits on a subject: from two anchors of the neutral shape (fact 12).
 
     Args:
-        local: [V, 4] coordinates in the mouth's frame in units of its radius, and 1 for mouth vertices, else 0.
+        local: [V, 4] coordinates in the mouth's frame in units of its radius; 1 for mouth vertices, else 0.
         anchors: [2, 3] jaw joint and lip vertex of the template, m.
         anchors_identity: [S, 2, 3] their identity basis.
     """
@@ -32,7 +32,7 @@ class MouthPlacement:
     anchors_identity: Array
 
     def place(self, shape: Array) -> Array:
-        """[V, 3] the mouth's vertices for identity `shape` [S], zero elsewhere. The constants are fact 12's."""
+        """[V, 3] the mouth's vertices for identity `shape` [S], else zero. The constants are fact 12's."""
         jaw, lip = self.anchors + _combine(shape, self.anchors_identity)
         offset = lip - jaw
         distance = (offset * offset).sum() ** 0.5
@@ -158,8 +158,8 @@ class HeadRig:
         expr_rotation, pose_basis, pose_offset: See `Subject`.
         mouth: Placement of a rigid mouth cavity, or None.
         colors: [V, 3] sRGB albedo in [0, 1], or None.
-        regions: Named vertex sets: `head` (all but the lower neck) and `deformable` always; others as the rig has them
-            (`eyes`, `teeth`, `mouth`, `scalp`, ...).
+        regions: Named vertex sets: `head` (all but the lower neck) and `deformable` always; others as the rig has
+            them (`eyes`, `teeth`, `mouth`, `scalp`, ...).
     """
 
     name: str
@@ -216,8 +216,8 @@ class HeadRig:
     def resample(self, vertices: np.ndarray, bary: np.ndarray) -> HeadRig:
         """The rig on P points that are barycentric mixtures of its vertices.
 
-        Blendshapes are linear, so they commute with mixing exactly; skinning does wherever the three vertices share
-        their weights, and elsewhere uses the mixed weights (standard skinning of a refined mesh).
+        Blendshapes are linear, so they commute with mixing exactly; skinning does where the three vertices
+        share their weights, and elsewhere uses the mixed weights (as in a refined mesh).
 
         Args:
             vertices: int[P, 3] vertex ids.
@@ -244,7 +244,7 @@ class HeadRig:
         )
 
     def map(self, function: Callable[[Array], Array]) -> HeadRig:
-        """The same rig with `function` applied to every float array of the model (faces, UVs and regions stay)."""
+        """The same rig with `function` applied to every array of the model (faces, UVs, regions stay)."""
         keep = {"faces", "uvs", "uv_faces", "regions", "expression_range"}
         mouth = None if self.mouth is None else _map_arrays(self.mouth, function)
         return replace(_map_arrays(self, function, keep | {"mouth"}), mouth=mouth)

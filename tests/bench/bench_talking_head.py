@@ -1,4 +1,4 @@
-"""The whole road on a real video: track, fit, fit without the U-Net, play on both backends. About half an hour on two cores.
+"""The whole road on a real video: track, fit, fit without the U-Net, play on both backends. Half an hour.
 
     python -m pytest -m bench -s tests/bench/bench_talking_head.py
 
@@ -33,7 +33,19 @@ def road(shared: Path) -> Path:
     run("cap4d.cli", "rig", "import", "ict", shared / "ict/ict_facekit_light.npz", "-o", rig)
     run("cap4d.cli", "track", shared / "video/talking_head.mp4", "--rig", rig, "-o", OUT / "cap")
     run("cap4d.cli", "fit", OUT / "cap", "--rig", rig, "--preset", "low", "-o", OUT / "me.cap4d")
-    run("cap4d.cli", "fit", OUT / "cap", "--rig", rig, "--preset", "low", "--ablate", "unet", "-o", OUT / "without_unet.cap4d")
+    run(
+        "cap4d.cli",
+        "fit",
+        OUT / "cap",
+        "--rig",
+        rig,
+        "--preset",
+        "low",
+        "--ablate",
+        "unet",
+        "-o",
+        OUT / "without_unet.cap4d",
+    )
     return OUT
 
 

@@ -1,4 +1,4 @@
-"""The FLAME road on real-shaped material: import, photos, a debug avatar, and the two kinds of sequences that drive it.
+"""The FLAME road on real-shaped material: import, photos, a debug avatar, and what drives it.
 
 Also prints (with -s) the landmark error of the released fits and the expression error of retargeted vertices.
 """
@@ -22,7 +22,16 @@ def road(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flame")
     model, assets = shared / "flame/flame_standin.pkl", shared / "flame/cap4d_assets"
     run("rig", "import", "flame", model, "--assets", assets, "-o", folder / "flame.npz")
-    run("fit", shared / "photos/tesla", "--rig", folder / "flame.npz", "--preset", "debug", "-o", folder / "tesla.cap4d")
+    run(
+        "fit",
+        shared / "photos/tesla",
+        "--rig",
+        folder / "flame.npz",
+        "--preset",
+        "debug",
+        "-o",
+        folder / "tesla.cap4d",
+    )
     return folder
 
 
@@ -75,8 +84,8 @@ def test_codetalker_vertices_give_back_the_expressions(shared: Path, road: Path)
     print(f"largest error of any grid vertex {1e3 * moved:.3f} mm")
     assert moved < 1e-3
     out = road / "speech.mp4"
-    run("view", road / "tesla.cap4d", "--headless", "--backend", "cpu", "--size", "96x96", "--frames", 12, "--drive", source,
-        "--template", shared / "flame/codetalker/truth.npz", "--out", out)  # fmt: skip
+    run("view", road / "tesla.cap4d", "--headless", "--backend", "cpu", "--size", "96x96", "--frames", 12,
+        "--drive", source,        "--template", shared / "flame/codetalker/truth.npz", "--out", out)  # fmt: skip
     assert len(decoded(out)) == 12
 
 

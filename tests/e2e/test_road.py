@@ -1,4 +1,4 @@
-"""The whole story in one file: a head model, a capture of it, an avatar, a bundle, and the viewer playing it."""
+"""The whole story in one file: a head model, a capture of it, an avatar, the viewer playing it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ def run(*words: object) -> str:
     """Runs `cap4d WORDS...` (or `cap4d-view`, when the first word is `view`) as a user would."""
     module = "cap4d.app.main" if words[0] == "view" else "cap4d.cli"
     words = words[1:] if words[0] == "view" else words
-    done = subprocess.run([sys.executable, "-m", module, *map(str, words)], capture_output=True, text=True, timeout=900)
+    done = subprocess.run(
+        [sys.executable, "-m", module, *map(str, words)], capture_output=True, text=True, timeout=900
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -32,7 +34,16 @@ def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("road")
     run("rig", "import", "builtin", "-o", folder / "rig.npz")
     synthesize(load_rig(folder / "rig.npz"), folder / "capture", views=6, frames=24, size=128, seed=3)
-    run("fit", folder / "capture", "--rig", folder / "rig.npz", "--preset", "debug", "-o", folder / "avatar.cap4d")
+    run(
+        "fit",
+        folder / "capture",
+        "--rig",
+        folder / "rig.npz",
+        "--preset",
+        "debug",
+        "-o",
+        folder / "avatar.cap4d",
+    )
     return folder
 
 
@@ -70,7 +81,9 @@ def test_an_expression_changes_the_picture_where_it_should(road: Path) -> None:
     neutral = avatar.render(np.zeros(len(names), np.float32), camera, background=(1, 1, 1)).astype(float)
     opened = np.zeros(len(names), np.float32)
     opened[names.index("jawOpen")] = 1
-    change = np.abs(avatar.render(opened, camera, background=(1, 1, 1)).astype(float) - neutral)[..., :3].mean(-1)
+    change = np.abs(avatar.render(opened, camera, background=(1, 1, 1)).astype(float) - neutral)[
+        ..., :3
+    ].mean(-1)
     rows = change.sum(1)
     assert change.max() > 40
     assert np.average(np.arange(128), weights=rows) > 64, "opening the jaw moves the lower half of the face"

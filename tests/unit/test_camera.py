@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from cap4d import ArgumentError, Camera
 from cap4d.camera import head_fixed, opencv_from_rig, orbit_camera
 from cap4d.rotation import axis_angle_to_rotmat
@@ -16,7 +15,9 @@ def test_crop_and_resize_keep_what_a_pixel_sees() -> None:
     camera = orbit_camera(yaw_deg=20, pitch_deg=10, **ORBIT)
     points = np.random.default_rng(0).normal(scale=0.1, size=(10, 3))
     pixels = camera.project(points)
-    np.testing.assert_allclose(camera.cropped(30, -5, 50, 60).project(points)[:, :2], pixels[:, :2] - [30, -5])
+    np.testing.assert_allclose(
+        camera.cropped(30, -5, 50, 60).project(points)[:, :2], pixels[:, :2] - [30, -5]
+    )
     np.testing.assert_allclose(camera.resized(400, 50).project(points)[:, :2], pixels[:, :2] * [2, 0.5])
 
 

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
 from cap4d import ArgumentError, DataError, cli
 
 COMMANDS = (

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from cap4d import _core
 from cap4d.camera import orbit_camera
 from cap4d.mesh import rasterize_mesh, shade, vertex_normals
 
-CAMERA = orbit_camera(yaw_deg=0, pitch_deg=0, distance=1, target=np.zeros(3), fov_y_deg=30, width=64, height=48)
+CAMERA = orbit_camera(
+    yaw_deg=0, pitch_deg=0, distance=1, target=np.zeros(3), fov_y_deg=30, width=64, height=48
+)
 # one triangle facing the camera (which looks along +z, y down), counter-clockwise seen from it
 TRIANGLE = np.array([[-0.1, 0.1, 0.0], [0.1, 0.1, 0.05], [0.0, -0.1, -0.1]])
 FACES = np.array([[0, 1, 2]], np.int32)

@@ -36,7 +36,9 @@ def roots(path: Path) -> set[str]:
     return {name.split(".")[0] for name in imports(path)}
 
 
-@pytest.mark.parametrize("path", sources(*(f"cap4d/{r}" for r in CORE_RING), "app"), ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path", sources(*(f"cap4d/{r}" for r in CORE_RING), "app"), ids=lambda p: str(p.relative_to(ROOT))
+)
 def test_core_ring_and_app_never_import_torch(path: Path) -> None:
     assert "torch" not in roots(path)
 
@@ -60,7 +62,8 @@ def test_player_needs_only_its_light_dependencies() -> None:
 
 
 def test_importing_the_package_imports_neither_torch_nor_onnxruntime() -> None:
-    code = "import sys, cap4d; print([m for m in ('torch', 'onnxruntime', 'scipy', 'trimesh') if m in sys.modules])"
+    heavy = ("torch", "onnxruntime", "scipy", "trimesh")
+    code = f"import sys, cap4d; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -70,7 +73,9 @@ def test_cpp_maths_know_no_python_and_no_gl() -> None:
         if path.name.startswith(("bind_", "bindings", "module")):
             continue
         included = re.findall(r'#include\s*[<"]([^>"]+)', path.read_text())
-        assert not [name for name in included if "pybind" in name or "Python" in name or name.startswith("GL")], path
+        assert not [
+            name for name in included if "pybind" in name or "Python" in name or name.startswith("GL")
+        ], path
 
 
 def test_no_vague_names() -> None:
