@@ -12,7 +12,7 @@ from cap4d.rotation import Array, axis_angle_to_rotmat
 NEAR = 0.01  # m; the splatting renderers cull Gaussians whose centre is nearer (gsplat's default)
 
 OPENCV_FROM_RIG = np.diag([1.0, -1.0, -1.0])
-"""Rigs keep FLAME's axes (x to the person's left, y up, face to +z); cameras have y down and z away (fact 10)."""
+"""Rigs have x to the person's left, y up, the face to +z (FLAME); cameras y down, z away (fact 10)."""
 
 
 def opencv_from_rig(points: Array) -> Array:
@@ -96,7 +96,7 @@ def orbit_camera(
     width: int,
     height: int,
 ) -> Camera:
-    """A camera on a sphere around `target` (OpenCV world): yaw 0 faces the face, positive pitch is from above."""
+    """A camera on a sphere around `target` (OpenCV world): yaw 0 is in front, positive pitch above."""
     yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
     away = np.array([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), -np.cos(yaw) * np.cos(pitch)])
     focal = 0.5 * height / np.tan(np.radians(fov_y_deg) / 2)

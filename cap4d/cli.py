@@ -1,4 +1,4 @@
-"""The `cap4d` command line: one function per command, with its imports inside. The device is chosen here only.
+"""The `cap4d` command line: one function per command, imports inside. The device is chosen here.
 
 Exit codes: 0 success, 1 bad data (one line: file, field, expected, found), 2 a bad argument, 130 interrupted.
 """

@@ -1,4 +1,4 @@
-"""The two ways a request can fail. Raised where the cause is known; the command line makes exit codes of them."""
+"""The two ways a request can fail. Raised where the cause is known; the CLI makes exit codes of them."""
 
 from __future__ import annotations
 

@@ -21,7 +21,8 @@ def bind_to(
         means, quats, log_scales: float32[N, 3], [N, 4], [N, 3], local to the triangles.
         binding: int32[N] into faces.
     Returns:
-        means [N, 3] m, quats [N, 4], scales [N, 3] m. Triangles without area give no gradient to their frames.
+        means [N, 3] m, quats [N, 4], scales [N, 3] m. Triangles without area give no gradient to their
+        frames.
     """
     return _Bind.apply(vertices, means, quats, log_scales, faces, binding)
 

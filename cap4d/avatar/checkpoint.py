@@ -1,4 +1,6 @@
-"""Checkpoints of a fit: tensors and plain values only, written whole or not at all, read without a pickle's powers."""
+"""Checkpoints of a fit: tensors and plain values only, written whole or not at all, read without a
+pickle's powers.
+"""
 
 from __future__ import annotations
 

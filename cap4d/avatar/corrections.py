@@ -1,8 +1,8 @@
 """Small learned corrections of what the tracker measured: head pose, expression, eyes, neck, and exposure.
 
-A correction is a function of the tracked sequence, never of one image alone: a linear map of the tracked parameters
-plus a residual that is smooth in time. Frames without a training image (held out, or in between) therefore get the
-correction of their neighbours, and their own image never enters.
+A correction is a function of the tracked sequence, never of one image alone: a linear map of the tracked
+parameters plus a residual that is smooth in time. Frames without a training image (held out, or in between)
+therefore get the correction of their neighbours, and their own image never enters.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from cap4d.rotation import axis_angle_to_rotmat, rotmat_to_axis_angle
 KERNEL_FRAMES = 1.0  # standard deviation of the residual's smoothing, in frames
 POSE_FIELDS = ("rot", "tra", "expr", "eye_rot", "neck_rot")
 EXPECTED_SIZE = {"rot": 0.01, "tra": 2e-3, "expr": 0.05, "eye_rot": 0.03, "neck_rot": 0.03}
-"""What a unit of correction is: rad, m, rig units, rad, rad. Regularisation and learning rates are relative to it."""
+"""What a unit of correction is: rad, m, rig units, rad, rad. Regularisation and learning rates are
+relative to it.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,9 @@ class Corrections(nn.Module):
         return Corrected(pose, (rotmat, self.pivot - rotmat @ self.pivot + tra))
 
     def penalty(self) -> torch.Tensor:
-        """Mean squared correction, in units of its expected size; the linear map's weights count like residuals."""
+        """Mean squared correction, in units of its expected size; the linear map's weights count like
+        residuals.
+        """
         return self.residual.square().mean() + self.linear.square().sum(0).mean()
 
     def corrected(self, clip: Clip) -> Clip:
@@ -103,7 +107,9 @@ def _units(n_expr: int) -> torch.Tensor:
 
 
 def _features(capture: Capture, trained: np.ndarray) -> np.ndarray:
-    """float32[T, F] tracked parameters, centred and scaled to unit variance over the trained frames, over sqrt(F)."""
+    """float32[T, F] tracked parameters, centred and scaled to unit variance over the trained frames, over
+    sqrt(F).
+    """
     raw = np.concatenate([getattr(capture, name) for name in POSE_FIELDS], 1).astype(np.float64)
     seen = raw[trained]
     spread = seen.std(0)

@@ -1,7 +1,7 @@
 """Growing and thinning the Gaussians while they are fitted (facts 30, 37; Kerbl et al. 2023, sec. 5.2).
 
-Everything here is a row operation: choose rows, make new ones, keep others. `Rows` carries it out on parameters, the
-binding and Adam's state alike, so that they stay aligned.
+Everything here is a row operation: choose rows, make new ones, keep others. `Rows` carries it out on
+parameters, the binding and Adam's state alike, so that they stay aligned.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ def densify(
 
     Args:
         evidence: Since the last round.
-        room: How many more Gaussians there may be after this round; those with the largest gradients are refined.
+        room: How many more Gaussians there may be after this round; those with the largest gradients are
+            refined.
         face_sizes: [M] m (fact 27), which turn local scales into world scales.
         per_face: Triangles keep at least one Gaussian if this is at least 1 (fact 30).
     """
@@ -144,8 +145,8 @@ def _clone(rows: Rows, chosen: torch.Tensor) -> None:
 def _split(rows: Rows, chosen: torch.Tensor, face_sizes: torch.Tensor, generator: torch.Generator) -> None:
     """Replaces large Gaussians by two samples of themselves, 1.6 times smaller.
 
-    The samples are drawn at the Gaussian's local scale. (The released code draws them at its world scale and adds them
-    to local coordinates, fact 30, which leaves the children where the parent was.)
+    The samples are drawn at the Gaussian's local scale. (The released code draws them at its world scale and
+    adds them to local coordinates, fact 30, which leaves the children where the parent was.)
     """
     # `chosen` speaks of the rows before cloning appended to them.
     index = chosen.nonzero()[:, 0].repeat(CHILDREN)

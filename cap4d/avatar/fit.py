@@ -1,7 +1,7 @@
 """Fitting an avatar to captures of a person: the loop around the trainer, and the files it leaves.
 
-Beside `me.cap4d` stand `me.fit.json` (numbers), `me.fit.png` (held-out frames: truth, ours, nearest training frame) and,
-while the fit runs, `me.fit.ckpt`.
+Beside `me.cap4d` stand `me.fit.json` (numbers), `me.fit.png` (held-out frames: truth, ours, nearest training
+frame) and, while the fit runs, `me.fit.ckpt`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def fit(
     """Fits an avatar and writes it, its report and its picture.
 
     Args:
-        captures: Folders of one person; the first one gives the identity, the idle clip and the default camera.
+        captures: Folders of one person; the first one gives the identity, the idle clip and the default
+            camera.
         rig: The head rig of the captures.
         output: `.cap4d` file to write.
         preset: Name of a preset, or one.

@@ -1,7 +1,9 @@
-"""How long and how finely an avatar is fitted. `debug` takes about a minute, `low` is for CPUs; both at 256 px.
+"""How long and how finely an avatar is fitted. `debug` takes about a minute, `low` is for CPUs; both at 256
+px.
 
-The released system's schedules (fact 37) run 25k to 100k steps on a GPU. A short schedule needs larger steps: learning
-rates here are the released ones (fact 36) times what the shorter road asks for, decayed log-linearly as there.
+The released system's schedules (fact 37) run 25k to 100k steps on a GPU. A short schedule needs larger steps:
+learning rates here are the released ones (fact 36) times what the shorter road asks for, decayed log-linearly
+as there.
 """
 
 from __future__ import annotations
@@ -72,7 +74,8 @@ class Preset:
         image_size: Longer side of the training images, px; larger ones are averaged down.
         grid_size: Side of the UV grid.
         deformer_width: First-layer channels of the U-Net (64 in the released system).
-        gaussians, per_face: About how many at the start, in proportion to area, and at least how many per triangle.
+        gaussians, per_face: About how many at the start, in proportion to area, and at least how many per
+            triangle.
         sh_degree, sh_every: Highest SH degree, and the steps between its increments from 0.
         paint: Take the first colours from the images instead of grey (fact 29).
         checkpoint_every: Steps between checkpoints.

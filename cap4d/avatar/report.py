@@ -1,4 +1,6 @@
-"""What a fit is worth: its pictures of held-out frames against the truth, beside the nearest training frames."""
+"""What a fit is worth: its pictures of held-out frames against the truth, beside the nearest training
+frames.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,14 @@ class FitReport:
 
     Args:
         held_out_psnr: Of the squared error pooled over all pixels of all held-out frames.
-        nearest_frame_psnr: The same for the baseline: for every held-out frame the training frame of the same size and
-            camera that resembles it most (least squared error, so it is the best that replaying could do).
+        nearest_frame_psnr: The same for the baseline: for every held-out frame the training frame of the same
+            size and camera that resembles it most (least squared error, so it is the best that replaying
+            could do).
         nearest_in_time_psnr: The same for the training frame nearest in time.
         held_out_psnr_mean, nearest_frame_psnr_mean: Means of the frames' own PSNRs.
         held_out_ssim: Mean SSIM.
-        between, tail: The same numbers for held-out frames with training frames on both sides in time, and for those
-            after the last training frame.
+        between, tail: The same numbers for held-out frames with training frames on both sides in time, and
+            for those after the last training frame.
         train_psnr: Pooled over some training frames.
         seconds: Wall time of the fit.
         peak_memory_mb: Greatest resident memory of the process.

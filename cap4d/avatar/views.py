@@ -45,7 +45,9 @@ class FitView:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Training views and held-out views; `tail` marks those held-out ones with no training frame after them."""
+    """Training views and held-out views; `tail` marks those held-out ones with no training frame after
+    them.
+    """
 
     train: tuple[FitView, ...]
     held_out: tuple[FitView, ...]
@@ -93,8 +95,8 @@ def split_views(captures: Sequence[Capture], views: Sequence[list[FitView]]) -> 
 def held_out_frames(capture: Capture) -> np.ndarray:
     """bool[T] the frames of a capture that are never trained on.
 
-    What the capture itself marks; else of a video (one camera, consecutive frames) every tenth frame and the last
-    tenth; else the last tenth of the frames, at most ten (fact 38), and nothing of fewer than four.
+    What the capture itself marks; else of a video (one camera, consecutive frames) every tenth frame and the
+    last tenth; else the last tenth of the frames, at most ten (fact 38), and nothing of fewer than four.
     """
     frames = len(capture)
     if capture.held_out is not None:

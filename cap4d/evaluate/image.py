@@ -34,7 +34,8 @@ def pooled_psnr(errors: np.ndarray) -> float:
 
 
 def ssim(image: np.ndarray, truth: np.ndarray) -> float:
-    """Mean structural similarity, Wang et al. 2004, eq. 13: Gaussian window 11x11 of sigma 1.5, only where it fits.
+    """Mean structural similarity, Wang et al. 2004, eq. 13: Gaussian window 11x11 of sigma 1.5, only where it
+    fits.
 
     The mean over the colour channels of the images' mean SSIM, in float64.
     """

@@ -1,4 +1,6 @@
-"""A fitted avatar as the file a player opens: its network as ONNX, its Gaussians raw, an idle clip, a picture."""
+"""A fitted avatar as the file a player opens: its network as ONNX, its Gaussians raw, an idle clip, a
+picture.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ def export_bundle(
         model: The avatar.
         rig: The rig it stands on.
         capture: Its identity is the avatar's, its first camera the default one.
-        clip: The capture's parameters as the fit corrected them, for the idle clip; None: as they were tracked.
+        clip: The capture's parameters as the fit corrected them, for the idle clip; None: as they were
+            tracked.
     Raises:
         Cap4dError: The exported network does not answer as the fitted one does.
     """

@@ -1,7 +1,8 @@
 """The deformation network as a self-contained ONNX file, and how far it is from torch.
 
 The graph is written node by node: it is short, and holds nothing but what a player needs. Input `offsets`
-float32[1, 3, S, S] m, output `deformation` float32[1, 3, S, S] m; mask, positional encoding and scales are inside.
+float32[1, 3, S, S] m, output `deformation` float32[1, 3, S, S] m; mask, positional encoding and scales are
+inside.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ def export_deformer(deformer: Deformer) -> bytes:
     graph.constant("scale", deformer.mask.numpy()[None, None] / np.float32(DEFORM_STD))
     half = ENCODING_CHANNELS // 2
     encoding = deformer.encoding.numpy()[None]
-    # Only one row and one column of it is stored: the whole would weigh a third of what the network reads per frame.
+    # Only one row and one column of it is stored: the whole would weigh a third of what the network reads per
+    # frame.
     graph.constant("rows", encoding[:, :half, :, :1])
     graph.constant("columns", encoding[:, half:, :1, :])
     graph.constant("plane", np.array([1, half, size, size], np.int64))
@@ -40,7 +42,8 @@ def export_deformer(deformer: Deformer) -> bytes:
 
 
 def worst_difference(onnx_model: bytes, deformer: Deformer, offsets: torch.Tensor) -> float:
-    """Largest difference between onnxruntime and torch on maps [B, 3, S, S] m, relative to the range of torch's answers.
+    """Largest difference between onnxruntime and torch on maps [B, 3, S, S] m, relative to the range of
+    torch's answers.
 
     Zero where the network answers nothing but zeros, as it does before its first step.
     """

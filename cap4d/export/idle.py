@@ -1,4 +1,6 @@
-"""What an avatar does when nothing drives it: a few seconds of its own capture, or a calm face that blinks."""
+"""What an avatar does when nothing drives it: a few seconds of its own capture, or a calm face that
+blinks.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,18 @@ FIELDS = ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra")
 
 
 def idle_clip(clip: Clip, expression_names: tuple[str, ...]) -> Clip:
-    """A clip that can repeat: from the capture's own where that is a film, else a still of its calmest frame."""
+    """A clip that can repeat: from the capture's own where that is a film, else a still of its calmest
+    frame.
+    """
     if clip.duration >= SHORTEST and is_film(clip):
         return looped(clip)
     return still(clip, int(np.abs(clip.expr).sum(1).argmin()), expression_names)
 
 
 def is_film(clip: Clip) -> bool:
-    """Whether its frames follow each other in time: then a frame resembles the next one more than any other."""
+    """Whether its frames follow each other in time: then a frame resembles the next one more than any
+    other.
+    """
     spread = np.abs(clip.expr - clip.expr.mean(0)).sum()
     return float(np.abs(np.diff(clip.expr, axis=0)).sum()) < 0.5 * spread
 
@@ -33,7 +39,8 @@ def is_film(clip: Clip) -> bool:
 def looped(clip: Clip) -> Clip:
     """The clip's first seconds without its first half second, into which the end is blended instead.
 
-    So the last frame precedes the first one. Rotations within a clip differ little and are blended as vectors.
+    So the last frame precedes the first one. Rotations within a clip differ little and are blended as
+    vectors.
     """
     frames = min(len(clip), round(LONGEST * clip.fps))
     seam = min(round(SEAM * clip.fps), frames // 3)

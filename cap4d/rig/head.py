@@ -1,8 +1,8 @@
 """One head model for all: a linear shape space, a linear expression space, and a few rotating joints.
 
-Blendshapes and linear blend skinning are written once here and serve NumPy arrays and torch tensors alike. A rig
-may stand on any points that are barycentric mixtures of its mesh (`resample`): the whole mesh, tracked landmarks,
-or the UV grid. No file access here (see store.py).
+Blendshapes and linear blend skinning are written once here and serve NumPy arrays and torch tensors alike.
+A rig may stand on any points that are barycentric mixtures of its mesh (`resample`): the whole mesh, tracked
+landmarks, or the UV grid. No file access here (see store.py).
 """
 
 from __future__ import annotations
@@ -158,8 +158,8 @@ class HeadRig:
         expr_rotation, pose_basis, pose_offset: See `Subject`.
         mouth: Placement of a rigid mouth cavity, or None.
         colors: [V, 3] sRGB albedo in [0, 1], or None.
-        regions: Named vertex sets: `head` (all but the lower neck) and `deformable` always; others as the rig has
-            them (`eyes`, `teeth`, `mouth`, `scalp`, ...).
+        regions: Named vertex sets: `head` (all but the lower neck) and `deformable` always; others as the
+            rig has them (`eyes`, `teeth`, `mouth`, `scalp`, ...).
     """
 
     name: str

@@ -159,9 +159,9 @@ class Weights:
     iris: float = 2.0
     gap: float = 1.0
     outlier: float = 3.0
-    shape: float = 0.5
-    expr: float = 2.0
-    sparse: float = 8.0
+    shape: float = 0.2
+    expr: float = 1.0
+    sparse: float = 60.0
     range: float = 2000.0
     gaze: float = 5.0
     roll: float = 1000.0

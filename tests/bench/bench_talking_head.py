@@ -61,6 +61,7 @@ def test_the_avatar_beats_the_nearest_training_frame(road: Path) -> None:
 
 def test_both_backends_draw_the_same_frames(road: Path) -> None:
     for backend in ("cpu", "gl"):
+        (road / backend).mkdir()
         run("cap4d.app.main", road / "me.cap4d", "--headless", "--backend", backend, "--frames", 120,
             "--out", road / backend / "frame_%04d.png", "--stats", road / f"{backend}.json")  # fmt: skip
     worst = min(psnr(frame, road / "gl" / frame.name) for frame in sorted((road / "cpu").glob("*.png")))

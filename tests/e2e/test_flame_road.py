@@ -84,8 +84,8 @@ def test_codetalker_vertices_give_back_the_expressions(shared: Path, road: Path)
     print(f"largest error of any grid vertex {1e3 * moved:.3f} mm")
     assert moved < 1e-3
     out = road / "speech.mp4"
-    run("view", road / "tesla.cap4d", "--headless", "--backend", "cpu", "--size", "96x96", "--frames", 12,
-        "--drive", source,        "--template", shared / "flame/codetalker/truth.npz", "--out", out)  # fmt: skip
+    run("view", road / "tesla.cap4d", "--headless", "--backend", "cpu", "--size", "96x96",
+        "--frames", 12, "--drive", source,        "--template", shared / "flame/codetalker/truth.npz", "--out", out)  # fmt: skip
     assert len(decoded(out)) == 12
 
 

@@ -16,8 +16,7 @@ from cap4d.rig.builtin.identity import identity_modes
 from cap4d.rig.builtin.paint import paint
 from cap4d.rig.builtin.parts import build_ear, build_eye, build_hair, build_shirt, build_teeth, build_tongue
 from cap4d.rig.builtin.sheet import Mesh, assemble, smoothstep
-from cap4d.rig.builtin.skin import CORNER_COLUMN, row_of
-from cap4d.rig.builtin.skin import build_skin as _build_skin
+from cap4d.rig.builtin.skin import CORNER_COLUMN, build_skin, row_of
 from cap4d.rig.head import HeadRig
 
 NECK = np.array([0.0, -78.0, -30.0])  # mm; where the neck bends under the head
@@ -30,7 +29,7 @@ def build_mesh() -> Mesh:
         build_teeth("teeth_upper", 1, 24, 79, -55, -44),
         build_teeth("teeth_lower", -1, 22, 76.5, -55.3, -63.5),
     )
-    parts = [*_build_skin(), build_eye(), *teeth, build_tongue(), build_ear(), build_hair(), build_shirt()]
+    parts = [*build_skin(), build_eye(), *teeth, build_tongue(), build_ear(), build_hair(), build_shirt()]
     return assemble([paint(p) for p in parts], left_uv, right_uv)
 
 

@@ -246,7 +246,7 @@ def pouch(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
     tall = half * np.cos(angle) * (1 + 0.35 * np.sin(angle))
     deep = 46 * np.sin(angle) ** 0.6 * np.array([0, 0, 1.0])
     line = (1 - t) * upper + t * lower
-    rows = middle * 0 + middle + tall - deep
+    rows = middle + tall - deep
     rows[0], rows[-1] = line[0], line[-1]
     rows[..., 0] = line[..., 0] * (1 + 0.18 * np.sin(angle[..., 0]))
     return rows
@@ -291,66 +291,71 @@ def skin_uv(theta: np.ndarray) -> np.ndarray:
     return np.stack([np.broadcast_to(u, v.shape), v], -1)
 
 
+# The rows behind each rim: which one, over which columns, to which side (1 up, -1 down), and how it is made.
+EYE_COLUMNS, LIP_COLUMNS = np.arange(CORNER_COLUMN, OUTER_COLUMN + 1), np.arange(0, CORNER_COLUMN + 1)
+STRIPS = (
+    ("upper_lid", EYE_COLUMNS, 1, inside_lids),
+    ("lower_lid", EYE_COLUMNS, -1, inside_lids),
+    ("upper_lip", LIP_COLUMNS, 1, inside_lips),
+    ("lower_lip", LIP_COLUMNS, -1, inside_lips),
+)
+
+
 def build_skin() -> tuple[Part, Part]:
-    """The skin with the insides of lids and lips, and the mouth's pouch, which shares its first and last
-    row's places.
+    """The skin with the insides of lids and lips, and the mouth's pouch, which starts and ends where these end.
 
     Marks of the skin: `row` and `column` of the main grid (rows inside lids and lips carry their rim's row),
     `depth` 0 on the outside, 1.. for rows behind a rim.
     """
     bare, theta = skin_grid()
-    points = lip_relief(bare, theta)
-    rows, columns = theta.size * 0 + len(points), len(theta)
-    uv = skin_uv(theta)
-    ids = np.arange(rows * columns).reshape(rows, columns)
-    eye = (row_of("upper_lid"), row_of("lower_lid"))
-    lips = (row_of("upper_lip"), row_of("lower_lip"))
-    eye_columns, lip_columns = np.arange(CORNER_COLUMN, OUTER_COLUMN + 1), np.arange(0, CORNER_COLUMN + 1)
-    for (above, below), inner in ((eye, eye_columns[1:-1]), (lips, lip_columns[:-1])):
-        shared = np.setdiff1d(np.arange(columns), inner)
+    points, uv = lip_relief(bare, theta), skin_uv(theta)
+    ids = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
+    _join_outside_openings(ids, points)
+    cloud = [points.reshape(-1, 3)]
+    marks = [np.stack([*np.indices(ids.shape), np.zeros_like(ids)], -1).reshape(-1, 3)]
+    grids = [Grid(ids, uv, (row_of("upper_lid"), row_of("upper_lip")))]
+    strips, count = {}, ids.size
+    for name, columns, sign, make in STRIPS:
+        row = row_of(name)
+        strip = make(points[row, columns], sign)
+        strip_ids = count + np.arange(strip.shape[0] * strip.shape[1]).reshape(strip.shape[:2])
+        count += strip_ids.size
+        if sign < 0:  # below and above meet in the corners
+            ends = (0, -1) if "lid" in name else (-1,)
+            strip_ids[:, ends] = strips[name.replace("lower", "upper")][1:, ends]
+        strips[name] = np.concatenate([ids[row, columns][None], strip_ids])
+        cloud.append(strip.reshape(-1, 3))
+        depth = np.arange(1, len(strip) + 1)[:, None]
+        marks.append(np.stack(np.broadcast_arrays(row, columns, depth), -1).reshape(-1, 3))
+        grids.append(Grid(strips[name][::sign], _strip_uv(name, uv, columns)[::sign]))
+    cloud, marks = np.concatenate(cloud), np.concatenate(marks)
+    lining = pouch(cloud[strips["upper_lip"][-1]], cloud[strips["lower_lip"][-1]])
+    used, new = np.unique(np.concatenate([g.ids.ravel() for g in grids]), return_inverse=True)
+    cuts = np.cumsum([g.ids.size for g in grids])[:-1]
+    renumbered = zip(grids, np.split(new, cuts), strict=True)
+    grids = tuple(Grid(n.reshape(g.ids.shape), g.uv, g.holes) for g, n in renumbered)
+    named = dict(zip(("row", "column", "depth"), marks[used].T, strict=True))
+    return Part("skin", cloud[used], grids, np.zeros((len(used), 3)), named), pouch_part(lining)
+
+
+def _join_outside_openings(ids: np.ndarray, points: np.ndarray) -> None:
+    """Makes one row of the two at the eyes' and the mouth's height, but for the columns that open (in place)."""
+    for above, below, inner in (
+        (row_of("upper_lid"), row_of("lower_lid"), EYE_COLUMNS[1:-1]),
+        (row_of("upper_lip"), row_of("lower_lip"), LIP_COLUMNS[:-1]),
+    ):
+        shared = np.setdiff1d(np.arange(ids.shape[1]), inner)
         ids[below, shared] = ids[above, shared]
         points[below, shared] = points[above, shared]
-    cloud, marks = (
-        [points.reshape(-1, 3)],
-        [np.stack([*np.indices((rows, columns)), np.zeros((rows, columns), int)], -1).reshape(-1, 3)],
-    )
-    grids = [Grid(ids, uv, (eye[0], lips[0]))]
-    count = rows * columns
-    strips = {}
-    for name, row, cols, sign, make in (
-        ("upper_lid", eye[0], eye_columns, 1, inside_lids),
-        ("lower_lid", eye[1], eye_columns, -1, inside_lids),
-        ("upper_lip", lips[0], lip_columns, 1, inside_lips),
-        ("lower_lip", lips[1], lip_columns, -1, inside_lips),
-    ):
-        strip = make(points[row, cols], sign)
-        n = len(strip)
-        strip_ids = count + np.arange(n * len(cols)).reshape(n, len(cols))
-        count += strip_ids.size
-        cloud.append(strip.reshape(-1, 3))
-        marks.append(
-            np.stack(np.broadcast_arrays(row, cols, np.arange(1, n + 1)[:, None]), -1).reshape(-1, 3)
-        )
-        ends = (0, -1) if "lid" in name else (-1,)
-        if sign < 0:
-            for end in ends:
-                strip_ids[:, end] = strips[name.replace("lower", "upper")][1:, end]
-        full = np.concatenate([ids[row, cols][None], strip_ids])
-        strips[name] = full
-        toward = (uv[eye if "lid" in name else lips, :][:, cols]).mean(0)
-        steps, hole = (INSIDE_LID, EYE_HOLE) if "lid" in name else (INSIDE_LIP, MOUTH_HOLE)
-        share = np.array(steps)[:, None, None] / (hole / 2)
-        strip_uv = (1 - share) * uv[row, cols] + share * toward
-        grids.append(Grid(full if sign > 0 else full[::-1], strip_uv if sign > 0 else strip_uv[::-1]))
-    cloud, marks = np.concatenate(cloud), np.concatenate(marks)
-    used = np.zeros(len(cloud), bool)
-    used[np.concatenate([g.ids.ravel() for g in grids])] = True
-    new = np.cumsum(used) - 1
-    grids = tuple(Grid(new[g.ids], g.uv, g.holes) for g in grids)
-    lining = pouch(cloud[strips["upper_lip"][-1]], cloud[strips["lower_lip"][-1]])
-    cloud, marks = cloud[used], marks[used]
-    named = {"row": marks[:, 0], "column": marks[:, 1], "depth": marks[:, 2]}
-    return Part("skin", cloud, grids, np.zeros_like(cloud), named), pouch_part(lining)
+
+
+def _strip_uv(name: str, uv: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """[1 + n, K, 2] from a rim towards the middle of its opening in the atlas."""
+    kind = name.split("_")[1]
+    steps, hole = (INSIDE_LID, EYE_HOLE) if kind == "lid" else (INSIDE_LIP, MOUTH_HOLE)
+    middle = 0.5 * (uv[row_of(f"upper_{kind}"), columns] + uv[row_of(f"lower_{kind}"), columns])
+    share = np.array(steps)[:, None, None] / (hole / 2)
+    return (1 - share) * uv[row_of(name), columns] + share * middle
 
 
 def pouch_part(lining: np.ndarray) -> Part:
