@@ -302,7 +302,7 @@ STRIPS = (
 
 
 def build_skin() -> tuple[Part, Part]:
-    """The skin with the insides of lids and lips, and the mouth's pouch, which starts and ends where these end.
+    """The skin with the insides of lids and lips, and the mouth's pouch, which hangs on these.
 
     Marks of the skin: `row` and `column` of the main grid (rows inside lids and lips carry their rim's row),
     `depth` 0 on the outside, 1.. for rows behind a rim.
@@ -339,7 +339,7 @@ def build_skin() -> tuple[Part, Part]:
 
 
 def _join_outside_openings(ids: np.ndarray, points: np.ndarray) -> None:
-    """Makes one row of the two at the eyes' and the mouth's height, but for the columns that open (in place)."""
+    """Makes the two rows at the eyes and at the mouth one, but for the columns that open (in place)."""
     for above, below, inner in (
         (row_of("upper_lid"), row_of("lower_lid"), EYE_COLUMNS[1:-1]),
         (row_of("upper_lip"), row_of("lower_lip"), LIP_COLUMNS[:-1]),
