@@ -1,7 +1,7 @@
-"""Which point of a rig each face landmark is, for any rig: look at renders of the rig as at photos, and project back.
+"""Which point of a rig each face landmark is, for any rig: look at renders as at photos, and project back.
 
-The rig's neutral head is drawn from a few sides, once with closed lips and once with open ones (closed lips cannot
-tell the upper from the lower). A landmark found in a picture is the surface point its pixel shows.
+The rig's neutral head is drawn from a few sides, once with closed lips and once with open ones (closed lips
+cannot tell the upper from the lower). A landmark found in a picture is the surface point its pixel shows.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def opening_expression(rig: HeadRig, lips: Correspondence) -> np.ndarray | None:
 
 @dataclass(frozen=True, eq=False)
 class _Sighting:
-    """One view: for each landmark the triangle it lies on (-1: none), where on it, and how squarely it is seen."""
+    """One view: for each landmark the triangle it lies on (-1: none), where, and how squarely it is seen."""
 
     face: np.ndarray
     bary: np.ndarray

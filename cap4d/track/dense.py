@@ -1,8 +1,8 @@
 """Finer than landmarks: every frame must agree with every other about the colour of each point of the skin.
 
-Thousands of surface points are followed through the video; pose, expression and identity are refined until each point
-looks the same in all frames (group-wise registration: the variance over frames is what is minimised, so there is no
-reference frame to drift from). Landmarks, priors and temporal smoothness of solve.py stay on.
+Thousands of surface points are followed through the video; pose, expression and gaze are refined until each
+point looks the same in all frames (group-wise registration: the variance over frames is minimised, so there
+is no reference frame to drift from). Landmarks, priors and temporal smoothness of solve.py stay on.
 """
 
 from __future__ import annotations
@@ -93,7 +93,9 @@ def refine(
     lightness = np.stack([_lightness(image(t), scale) for t in valid])
     x = problem.variables(solution)
     for blur, iterations in ROUNDS:
-        pictures = torch.as_tensor(np.stack([normalised(picture, blur * unit, CONTEXT * unit) for picture in lightness]))[:, None]
+        pictures = torch.as_tensor(
+            np.stack([normalised(picture, blur * unit, CONTEXT * unit) for picture in lightness])
+        )[:, None]
         term = _SkinTerm(skin, pictures, problem, torch.as_tensor(valid), scale)
         before = term.spread(x)
         problem.more_evidence = term

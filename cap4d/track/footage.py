@@ -1,4 +1,4 @@
-"""What is tracked: the frames of a video, upright, or the photos of a folder. Frames are streamed, never all held."""
+"""What is tracked: the frames of a video, upright, or the photos of a folder; streamed, never all held."""
 
 from __future__ import annotations
 

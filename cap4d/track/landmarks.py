@@ -1,4 +1,4 @@
-"""Face landmarks and person segmentation by MediaPipe 0.10.21, the last release whose wheel carries its models.
+"""Face landmarks and person segmentation by MediaPipe 0.10.21, the last release that carries its models.
 
 478 points: 468 of the face mesh, then an iris centre and four points around it for each eye.
 """
@@ -22,8 +22,8 @@ N_LANDMARKS = 478
 IRIS = {"right": 468, "left": 473}  # centre; the four after it lie around it
 MAX_CANVAS = 1024  # px; the network looks at 192, more only costs time
 WOBBLES = ((0.0, 1.0, 0.0, 0.0), (4.0, 0.94, 9.0, -5.0), (-5.0, 1.06, -7.0, 8.0), (2.0, 0.88, -4.0, -9.0))
-"""Rotation deg, scale, shift x, y (thousandths of the canvas) of the copies of an image whose landmarks are averaged: one
-copy has 0.20 px of jitter and 0.17 px of bias against the mean of many (512 px talking head), four have 0.15 and half."""
+"""Rotation deg, scale, shift x, y (thousandths of the canvas) of the copies of an image whose landmarks are
+averaged. On a 512 px talking head one copy jitters by 0.21 px, four by 0.15, eight by 0.13."""
 
 _CHATTER = re.compile(
     rb"Created TensorFlow Lite XNNPACK|All log messages before absl::InitializeLog|inference_feedback_manager"
@@ -52,7 +52,7 @@ class Detector:
             graph.close()
 
     def landmarks(self, image: np.ndarray) -> np.ndarray | None:
-        """The face in uint8[H, W, 3]: float64[478, 2] px (pixel centres at .5), or None when there is no face.
+        """The face in uint8[H, W, 3]: float64[478, 2] px (pixel centres at .5), or None where there is none.
 
         The mean over wobbled copies of the image in which the face was found.
         """
@@ -65,7 +65,7 @@ class Detector:
         return np.mean(found, 0) if found else None
 
     def matte(self, image: np.ndarray) -> np.ndarray:
-        """Coarse coverage of the person, float32[H, W] in [0, 1]: the mean over the image and its mirror image."""
+        """Coarse coverage of the person, float32[H, W] in [0, 1]: the mean over image and mirror image."""
         affine, size = _canvas(image.shape[:2], WOBBLES[0])
         square = _warped(image, affine, size)
         straight = self._segmentation.process(square).segmentation_mask
@@ -78,7 +78,7 @@ class Detector:
 
 @contextmanager
 def without_native_chatter() -> Iterator[None]:
-    """Leaves MediaPipe's known start-up lines out of what is written to stderr meanwhile; all else passes at once.
+    """Leaves MediaPipe's known start-up lines out of what goes to stderr meanwhile; all else passes at once.
 
     They are written by C++ whose logger Python cannot configure.
     """
@@ -106,7 +106,7 @@ def _pass_on(reading: int, writing: int) -> None:
 
 
 def _import_mediapipe() -> ModuleType:
-    """MediaPipe with today's protobuf: it asks the message factory for a method whose new name is GetMessageClass.
+    """MediaPipe with today's protobuf: it asks the message factory for what is now called GetMessageClass.
 
     The protobuf release notes of 4.22 and 5.26 deprecate and remove `MessageFactory.GetPrototype`.
     """

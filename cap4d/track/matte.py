@@ -30,7 +30,7 @@ def refine_matte(image: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 def guided_filter(guide: np.ndarray, values: np.ndarray, radius: int, epsilon: float) -> np.ndarray:
     """The locally linear function of the guide's colours that is nearest to `values`, averaged over windows.
 
-    The linear functions are found on a coarser grid where windows are large (He, Sun 2015, "Fast guided filter").
+    Where windows are large, the functions are found on a coarser grid (He, Sun 2015, "Fast guided filter").
     Args:
         guide: float32[H, W, 3].
         values: float32[H, W].

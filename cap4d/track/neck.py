@@ -1,4 +1,4 @@
-"""How the neck bends: the head of a capture stands still (fact 31), so the shoulders must turn the other way."""
+"""How the neck bends: a capture's head stands still (fact 31), so the shoulders must turn the other way."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from cap4d.rotation import axis_angle_to_rotmat, rotmat_to_axis_angle
 def steady_neck(rig: HeadRig, shape: np.ndarray, rot: np.ndarray, tra: np.ndarray) -> np.ndarray:
     """The neck rotations that keep the shoulders where they are in the world while the head moves.
 
-    Per frame the rotation R about the neck's joint J that brings R (v - J) nearest to where the resting shoulders
-    are, seen from the moved head (Kabsch 1976, weighted by how much the joint moves each vertex).
+    Per frame the rotation R about the neck's joint J that brings R (v - J) nearest to where the resting
+    shoulders are, seen from the moved head (Kabsch 1976, weighted by how much the joint moves each vertex).
 
     Args:
         shape: [S]; rot, tra: [T, 3] the head's pose in the world, rig axes.

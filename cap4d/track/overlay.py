@@ -1,4 +1,4 @@
-"""Pictures that show how well the rig lies on the person: its shaded mesh over each frame, and the landmarks."""
+"""Pictures of how well the rig lies on the person: its shaded mesh over each frame, and the landmarks."""
 
 from __future__ import annotations
 

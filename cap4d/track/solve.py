@@ -1,6 +1,6 @@
-"""The rig that explains the landmarks: one identity, and per frame expression, head pose and gaze; and the focal length.
+"""The rig that explains the landmarks: identity, focal length, and per frame expression, head pose and gaze.
 
-All frames are solved together by L-BFGS through the rig's torch form, in stages: head pose, identity, everything.
+All frames are solved together by L-BFGS through the rig's torch form, in stages: pose, identity, everything.
 Image quantities are measured in units of the face's size, so that the same weights serve any resolution.
 """
 
@@ -125,7 +125,7 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Rig parameters of T frames (as in `Capture`) and the focal length in px of each of C cameras; float64."""
+    """Rig parameters of T frames (as in `Capture`), and the focal lengths of C cameras in px; float64."""
 
     shape: np.ndarray
     expr: np.ndarray
@@ -198,14 +198,14 @@ def landmark_weights(weights: Weights, known: np.ndarray | None = None) -> np.nd
 
 
 def project(points: torch.Tensor, rot: torch.Tensor, tra: torch.Tensor, focal: torch.Tensor) -> torch.Tensor:
-    """Head points [T, P, 3] (rig axes) -> [T, P, 2] px from the principal point, for focal [T] px (facts 9, 10)."""
+    """Head points [T, P, 3], rig axes -> [T, P, 2] px from the principal point; focal [T] px (fact 10)."""
     world = points @ axis_angle_to_rotmat(rot).swapaxes(-1, -2) + tra[:, None]
     depth = (-world[..., 2:]).clamp_min(1e-3)
     return focal[:, None, None] * torch.cat([world[..., :1], -world[..., 1:2]], -1) / depth
 
 
 def reprojection_errors(rig: HeadRig, observations: Observations, solution: Solution) -> np.ndarray:
-    """[T, 478] px at an image of 512 px: the distance of the rig's points from the landmarks; NaN where not valid.
+    """[T, 478] px at an image of 512 px: the rig's points' distance from the landmarks; NaN where not valid.
 
     Only the iris centres of the iris points are on the rig; the rest of them are NaN.
     """
@@ -220,7 +220,7 @@ def reprojection_errors(rig: HeadRig, observations: Observations, solution: Solu
 
 
 class Problem:
-    """The energy and its variables: a dict of float64 tensors named as in `Solution` (tra, focal in units of their own)."""
+    """The energy and its variables, tensors named as in `Solution` (tra and focal in units of their own)."""
 
     def __init__(self, rig: HeadRig, observations: Observations, weights: Weights) -> None:
         self.rig = rig.map(lambda array: torch.as_tensor(np.asarray(array), dtype=torch.float64))

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+
 from cap4d.camera import Camera
 from cap4d.errors import ArgumentError, DataError
 

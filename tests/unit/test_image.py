@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from cap4d.errors import ArgumentError, DataError
 
 oiio = pytest.importorskip("OpenImageIO", reason="needs the extra [capture]")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from cap4d.camera import Camera, head_fixed, opencv_from_rig
 from cap4d.mesh import shade
 from cap4d.rotation import axis_angle_to_rotmat

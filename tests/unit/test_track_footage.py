@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from cap4d.errors import ArgumentError, DataError
 
 av = pytest.importorskip("av")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from cap4d.rotation import axis_angle_to_rotmat
 
 for module in ("OpenImageIO", "torch", "cv2"):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from cap4d.camera import opencv_from_rig
 from cap4d.rotation import axis_angle_to_rotmat
 

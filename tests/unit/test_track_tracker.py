@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from cap4d.camera import Camera, head_fixed, opencv_from_rig
 from cap4d.errors import ArgumentError, DataError
 from cap4d.mesh import shade
