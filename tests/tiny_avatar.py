@@ -76,7 +76,9 @@ def tiny_camera(size: int = 48) -> Camera:
 
 
 def write_tiny_capture(path: Path, *, frames: int = 24, size: int = 48, seed: int = 0) -> None:
-    """A film of a painted sheet that bulges and shears: exact parameters, images drawn by the splatting code."""
+    """A film of a painted sheet that bulges and shears: exact parameters, images drawn by the splatting
+    code.
+    """
     rig, rng = tiny_rig(), np.random.default_rng(seed)
     truth = tiny_avatar(rig, gaussians=900, sh_degree=0, width=None, seed=seed + 1)
     centres = truth.subject.neutral[truth.faces].mean(1)[truth.binding]

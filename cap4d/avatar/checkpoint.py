@@ -1,6 +1,4 @@
-"""Checkpoints of a fit: tensors and plain values only, written whole or not at all, read without a
-pickle's powers.
-"""
+"""Checkpoints of a fit: tensors and plain values, written whole or not at all, read weights-only."""
 
 from __future__ import annotations
 

@@ -21,9 +21,7 @@ from cap4d.rotation import axis_angle_to_rotmat, rotmat_to_axis_angle
 KERNEL_FRAMES = 1.0  # standard deviation of the residual's smoothing, in frames
 POSE_FIELDS = ("rot", "tra", "expr", "eye_rot", "neck_rot")
 EXPECTED_SIZE = {"rot": 0.01, "tra": 2e-3, "expr": 0.05, "eye_rot": 0.03, "neck_rot": 0.03}
-"""What a unit of correction is: rad, m, rig units, rad, rad. Regularisation and learning rates are
-relative to it.
-"""
+"""A unit of correction (rad, m, rig units, rad, rad), which penalties and learning rates are relative to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +76,7 @@ class Corrections(nn.Module):
         return Corrected(pose, (rotmat, self.pivot - rotmat @ self.pivot + tra))
 
     def penalty(self) -> torch.Tensor:
-        """Mean squared correction, in units of its expected size; the linear map's weights count like
-        residuals.
-        """
+        """Mean squared residual plus mean squared column of the linear map, in units of the expected size."""
         return self.residual.square().mean() + self.linear.square().sum(0).mean()
 
     def corrected(self, clip: Clip) -> Clip:
@@ -107,9 +103,7 @@ def _units(n_expr: int) -> torch.Tensor:
 
 
 def _features(capture: Capture, trained: np.ndarray) -> np.ndarray:
-    """float32[T, F] tracked parameters, centred and scaled to unit variance over the trained frames, over
-    sqrt(F).
-    """
+    """float32[T, F] tracked parameters, standardised over the trained frames, over sqrt(F)."""
     raw = np.concatenate([getattr(capture, name) for name in POSE_FIELDS], 1).astype(np.float64)
     seen = raw[trained]
     spread = seen.std(0)

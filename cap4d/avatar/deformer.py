@@ -22,8 +22,7 @@ INIT_STD = 0.02
 
 
 class Deformer(nn.Module):
-    """Expression offsets [B, 3, S, S] m -> deformation [B, 3, S, S] m, both in the posed head frame (facts
-    20-23).
+    """Expression offsets [B, 3, S, S] m -> deformation [B, 3, S, S] m in the posed head frame (facts 20-23).
 
     It starts at zero deformation: the last layer's weight and bias are zero.
 
@@ -114,9 +113,7 @@ class _Level(nn.Module):
 
 
 def positional_encoding(size: int) -> torch.Tensor:
-    """[24, S, S]: for row, then column, the sines, then the cosines of 2^0..2^5 times the coordinate in
-    [-1, 1) (fact 21).
-    """
+    """[24, S, S]: for row, then column: sines, then cosines of 2^0..2^5 times it, in [-1, 1) (fact 21)."""
     coordinate = torch.arange(size, dtype=torch.float64) / size * 2 - 1
     angles = coordinate * 2.0 ** torch.arange(ENCODING_FREQUENCIES, dtype=torch.float64)[:, None]  # [6, S]
     waves = torch.cat([angles.sin(), angles.cos()])  # [12, S]

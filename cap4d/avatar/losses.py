@@ -56,8 +56,7 @@ def photometric(image: torch.Tensor, target: torch.Tensor, weights: LossWeights)
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Structural similarity of every pixel and channel, zero-padded at the border (as the splatting codes
-    train with).
+    """Structural similarity of every pixel and channel, zero-padded as the splatting codes train with it.
 
     Wang et al. 2004, eq. 13, with an 11x11 Gaussian window of sigma 1.5.
     Args:
@@ -75,9 +74,7 @@ def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 class _Blur(torch.autograd.Function):
-    """A zero-padded blur with a symmetric window is its own adjoint, so backward is the same blur of the
-    gradient.
-    """
+    """A zero-padded blur with a symmetric window is its own adjoint: backward is the same blur."""
 
     @staticmethod
     def forward(ctx, image):
@@ -120,15 +117,12 @@ def position_loss(means: torch.Tensor, visible: torch.Tensor, limit: float) -> t
 def scale_loss(log_scales: torch.Tensor, visible: torch.Tensor, limit: float) -> torch.Tensor:
     """Norm of what local scales [N, 3] of visible Gaussians bool[N] exceed `limit` by (fact 34)."""
     excess = F.relu(log_scales.exp() - limit)
-    # A norm has no gradient at zero: the tiny constant gives it one, and is far below any excess that
-    # matters.
+    # A norm has no gradient at zero: the constant, far below any excess that matters, gives it one.
     return _mean_over((excess.square().sum(-1) + 1e-16).sqrt() - 1e-8, visible)
 
 
 def laplacian_loss(deformation: torch.Tensor) -> torch.Tensor:
-    """Mean over inner pixels of the squared 4-neighbour Laplacian of a map [..., 3, S, S] m over 0.0108
-    (fact 35).
-    """
+    """Mean over inner pixels of the squared Laplacian of maps [..., 3, S, S] over 0.0108 (fact 35)."""
     m = deformation / DEFORM_STD
     inner = m[..., 1:-1, 1:-1]
     around = m[..., :-2, 1:-1] + m[..., 2:, 1:-1] + m[..., 1:-1, :-2] + m[..., 1:-1, 2:]
@@ -136,9 +130,7 @@ def laplacian_loss(deformation: torch.Tensor) -> torch.Tensor:
 
 
 def relative_deformation_loss(deformation: torch.Tensor, neutral: torch.Tensor) -> torch.Tensor:
-    """Mean squared length of the expression-dependent part of [G, 3] m deformations, over 0.0108 (fact
-    35).
-    """
+    """Mean squared length of what the expression adds to [G, 3] m deformations, over 0.0108 (fact 35)."""
     return ((deformation - neutral) / DEFORM_STD).square().sum(-1).mean()
 
 

@@ -1,5 +1,4 @@
-"""The avatar while it is being fitted: a head on the UV grid, a network that moves the grid, Gaussians on its
-triangles.
+"""The avatar while it is fitted: a head on the UV grid, a network that moves it, Gaussians on its triangles.
 
 Everything is in the head-fixed frame, OpenCV axes, metres; the head's pose is in the cameras (fact 31).
 """
@@ -107,9 +106,7 @@ class AvatarModel(nn.Module):
         return len(self.binding)
 
     def offsets(self, pose: Pose) -> torch.Tensor:
-        """[3, S, S] m: what expression and eyes move, with the jaw's own turn in both terms and no neck
-        (fact 20).
-        """
+        """[3, S, S] m: what expression and eyes move, jaw in both terms, neck in none (fact 20)."""
         with torch.no_grad():
             posed = self.subject.pose(pose.expr, eye_rot=pose.eye_rot, jaw_rot=pose.jaw_rot)
             neutral = self.subject.pose(torch.zeros_like(pose.expr), jaw_rot=pose.jaw_rot)
@@ -168,9 +165,7 @@ class AvatarModel(nn.Module):
 
 
 def initial_counts(rig: HeadRig, grid: UvGrid, *, gaussians: int, per_face: int) -> np.ndarray:
-    """int64[M] Gaussians per triangle: in proportion to area on the template, at least `per_face` (fact
-    29).
-    """
+    """int64[M] Gaussians per triangle: by area on the template, at least `per_face` (fact 29)."""
     corners = remesh(rig, grid).template.astype(np.float64)[grid.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return np.maximum(per_face, np.round(gaussians * areas / areas.sum())).astype(np.int64)

@@ -1,6 +1,4 @@
-"""First colours for the Gaussians, taken from the images through the rig's surface: a head start for short
-fits.
-"""
+"""First colours for the Gaussians, seen in the images through the surface: a start for short fits."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""How long and how finely an avatar is fitted. `debug` takes about a minute, `low` is for CPUs; both at 256
-px.
+"""How long and how finely an avatar is fitted: `debug` takes about a minute, `low` is for CPUs.
 
 The released system's schedules (fact 37) run 25k to 100k steps on a GPU. A short schedule needs larger steps:
 learning rates here are the released ones (fact 36) times what the shorter road asks for, decayed log-linearly

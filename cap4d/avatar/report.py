@@ -1,6 +1,4 @@
-"""What a fit is worth: its pictures of held-out frames against the truth, beside the nearest training
-frames.
-"""
+"""What a fit is worth: its pictures of held-out frames beside the truth and the nearest training frames."""
 
 from __future__ import annotations
 

@@ -154,8 +154,7 @@ class Trainer:
             first, last = group["ends"]
             group["lr"] = math.exp((1 - t) * math.log(first) + t * math.log(last))
 
-    # checkpoint
-    # ----------------------------------------------------------------------------------------------------
+    # checkpoint ------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """Everything a resumed fit needs: tensors, and plain numbers and lists."""

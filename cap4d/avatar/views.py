@@ -45,9 +45,7 @@ class FitView:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Training views and held-out views; `tail` marks those held-out ones with no training frame after
-    them.
-    """
+    """Training views and held-out views; `tail` marks held-out ones with no training frame after them."""
 
     train: tuple[FitView, ...]
     held_out: tuple[FitView, ...]

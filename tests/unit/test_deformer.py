@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+
 from cap4d.avatar.deformer import DEFORM_STD, Deformer, downsamplings, positional_encoding
 
-# The released state dict, outermost to innermost: down 27->64->128->256->512->512->512, and up again (fact 22).
+# The released state dict, outermost to innermost: down 27->64->128->256->512->512->512, then up (fact 22).
 RELEASED = {
     "model.model.0": (64, 27),
     "model.model.1.model.1": (128, 64),

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from cap4d.evaluate.image import mse, pooled_psnr, psnr, ssim
 
 

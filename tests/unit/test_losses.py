@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+
 from cap4d.avatar import losses
 from cap4d.avatar.losses import LossWeights
 from cap4d.evaluate.image import ssim
