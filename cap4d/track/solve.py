@@ -24,6 +24,8 @@ FOCAL_PRIOR = (
     1.3  # of the image's larger side: a phone at arm's length; photos leave focal and distance ambiguous
 )
 FOCAL_SPREAD = 0.2  # standard deviation of its logarithm
+STRIDE = 25  # iterations between looks at the progress
+ENOUGH = 5e-4  # share of the energy that as many iterations must win for the search to go on
 TRANSLATION_UNIT = 0.1  # m; brings the optimiser's variables to one scale
 
 OVAL = (
@@ -162,7 +164,7 @@ class Weights:
     shape: float = 0.2
     expr: float = 1.0
     sparse: float = 60.0
-    range: float = 2000.0
+    range: float = 10000.0
     gaze: float = 5.0
     roll: float = 1000.0
     pose_jerk: float = 3e4
@@ -289,11 +291,7 @@ class Problem:
             x[name] = x[name].detach().requires_grad_(name in free)
         variables = [x[name] for name in free]
         optimiser = torch.optim.LBFGS(
-            variables,
-            max_iter=iterations,
-            history_size=30,
-            line_search_fn="strong_wolfe",
-            tolerance_change=1e-7,
+            variables, max_iter=STRIDE, history_size=30, line_search_fn="strong_wolfe", tolerance_change=1e-9
         )
 
         def closure() -> torch.Tensor:
@@ -304,10 +302,12 @@ class Problem:
             energy.backward()
             return energy
 
-        energy = optimiser.step(closure)
-        log.debug(
-            "%s: energy %.1f -> %.1f", ", ".join(free), float(energy.detach()), float(closure().detach())
-        )
+        energies = [float(optimiser.step(closure).detach())]
+        for _ in range(STRIDE, iterations, STRIDE):
+            energies.append(float(optimiser.step(closure).detach()))  # that before the step
+            if energies[-2] - energies[-1] < ENOUGH * energies[-1]:
+                break
+        log.debug("%s: energy %s", ", ".join(free), " ".join(f"{energy:.0f}" for energy in energies))
 
     def evidence(self, x: dict[str, torch.Tensor], weight: torch.Tensor) -> torch.Tensor:
         """Robust squares of the residuals and of the errors of the gaps between lids and lips."""
