@@ -45,6 +45,8 @@ PLAIN_SHARE = 0.2  # what the weights of landmarks on plain skin are multiplied 
 FEATURE_SHARE = (
     0.5  # the same for lids, lips, brows and nose: lips roll and lids fold, which skin points cannot follow
 )
+POSE_JERK = 1e6  # as in Weights; turns, shifts and expressions that look alike would trade noise otherwise
+EXPR_JERK = 40.0
 LIPS_OUTLINE = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
 
 
@@ -80,6 +82,8 @@ def refine(
         feature=FEATURE_SHARE * weights.feature,
         plain=PLAIN_SHARE * weights.plain,
         outline=PLAIN_SHARE * weights.outline,
+        pose_jerk=POSE_JERK,
+        expr_jerk=EXPR_JERK,
     )
     problem = Problem(landmark_rig, observations, lighter)
     points = choose_points(rig, observations, solution)

@@ -79,7 +79,7 @@ def _opened(source: Path) -> av.container.InputContainer:
     try:
         container = av.open(str(source))
     except (av.FFmpegError, OSError) as error:
-        raise DataError(source, "video", expected="a readable video", found=error) from error
+        raise DataError(source, "video", expected="a readable video", found=error.strerror) from error
     if not container.streams.video:
         container.close()
         raise DataError(source, "video", expected="a video stream", found="none")
@@ -94,4 +94,4 @@ def _video_frames(source: Path) -> Iterator[np.ndarray]:
                 quarters = round(frame.rotation / 90) % 4
                 yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarters))
         except av.FFmpegError as error:
-            raise DataError(source, "video", expected="frames that decode", found=error) from error
+            raise DataError(source, "video", expected="frames that decode", found=error.strerror) from error

@@ -16,6 +16,7 @@ import torch
 from cap4d.rig.head import HeadRig
 from cap4d.rotation import axis_angle_to_rotmat
 from cap4d.track.landmarks import IRIS, N_LANDMARKS
+from cap4d.track.progress import progress
 
 log = logging.getLogger(__name__)
 
@@ -303,7 +304,8 @@ class Problem:
             return energy
 
         energies = [float(optimiser.step(closure).detach())]
-        for _ in range(STRIDE, iterations, STRIDE):
+        looks = range(STRIDE, iterations, STRIDE)
+        for _ in progress(looks, "solving for " + ", ".join(free), len(looks)):
             energies.append(float(optimiser.step(closure).detach()))  # that before the step
             if energies[-2] - energies[-1] < ENOUGH * energies[-1]:
                 break
