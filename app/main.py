@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cap4d.app.options import Options, parse_options
-from cap4d.errors import ArgumentError, Cap4dError
+from cap4d.errors import ArgumentError, exit_code
 
 log = logging.getLogger(__name__)
 
@@ -17,18 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0 success, 1 bad data or no OpenGL, 2 a bad argument, 130 interrupted."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     options = parse_options(argv)
-    try:
-        play(options)
-    except ArgumentError as error:
-        print(f"cap4d-view: {error}", file=sys.stderr)
-        return 2
-    except Cap4dError as error:
-        print(f"cap4d-view: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("cap4d-view: interrupted", file=sys.stderr)
-        return 130
-    return 0
+    return exit_code("cap4d-view", lambda: play(options))
 
 
 def play(options: Options) -> None:

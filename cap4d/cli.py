@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from cap4d.errors import ArgumentError, Cap4dError
+from cap4d.errors import exit_code
 
 EXAMPLES = """examples:
   cap4d demo                                          # the built-in head, built once, then played
@@ -27,17 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     arguments = build_parser().parse_args(argv)
-    try:
-        return arguments.run(arguments) or 0
-    except ArgumentError as error:
-        print(f"cap4d: {error}", file=sys.stderr)
-        return 2
-    except Cap4dError as error:
-        print(f"cap4d: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("cap4d: interrupted", file=sys.stderr)
-        return 130
+    return exit_code("cap4d", lambda: arguments.run(arguments))
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 
@@ -27,3 +29,17 @@ class DataError(Cap4dError):
 
 class ArgumentError(Cap4dError):
     """An argument makes no sense or names something that is not there (exit code 2)."""
+
+
+def exit_code(program: str, run: Callable[[], int | None]) -> int:
+    """Runs a program's work; a refusal becomes one line on stderr and a code: 1 bad data, 2 a bad argument."""
+    try:
+        return run() or 0
+    except ArgumentError as error:
+        line, code = str(error), 2
+    except Cap4dError as error:
+        line, code = str(error), 1
+    except KeyboardInterrupt:
+        line, code = "interrupted", 130
+    print(f"{program}: {line}", file=sys.stderr)
+    return code

@@ -42,7 +42,7 @@ def export_bundle(
     Args:
         model: The avatar.
         rig: The rig it stands on.
-        capture: Its identity is the avatar's, its first camera the default one.
+        capture: Its identity is the avatar's, its most frontal camera the default one.
         clip: The capture's parameters as the fit corrected them, for the idle clip; None: as they were
             tracked.
     Raises:
@@ -96,10 +96,13 @@ def checked_onnx(model: AvatarModel, clip: Clip) -> bytes:
 
 
 def default_camera(capture: Capture, clip: Clip) -> Camera:
-    """The capture's first camera as it stands to the head on average, in the head-fixed world."""
-    camera = next(iter(capture.cameras.values()))
+    """The capture's most frontal camera as it stands to the head on average, in the head-fixed world."""
     rot, tra = np.median(clip.rot, 0), np.median(clip.tra, 0)
-    return Camera(camera.K, head_fixed(camera.viewmat, rot, tra), camera.width, camera.height)
+    views = [
+        Camera(camera.K, head_fixed(camera.viewmat, rot, tra), camera.width, camera.height)
+        for camera in capture.cameras.values()
+    ]
+    return min(views, key=lambda view: view.position[2] / np.linalg.norm(view.position))
 
 
 def preview(model: AvatarModel, clip: Clip, camera: Camera) -> bytes:
