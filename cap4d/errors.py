@@ -32,7 +32,7 @@ class ArgumentError(Cap4dError):
 
 
 def exit_code(program: str, run: Callable[[], int | None]) -> int:
-    """Runs a program's work; a refusal becomes one line on stderr and a code: 1 bad data, 2 a bad argument."""
+    """Runs a program; a refusal becomes one line on stderr and a code: 1 bad data, 2 a bad argument."""
     try:
         return run() or 0
     except ArgumentError as error:

@@ -10,8 +10,9 @@ import torch
 import torch.nn.functional as F
 
 from cap4d.camera import Camera
-from cap4d.capture.capture import RELEASED_RIG, Capture, View
+from cap4d.capture.capture import Capture, View
 from cap4d.errors import ArgumentError, DataError
+from cap4d.rig.flame import RELEASED_RIG
 from cap4d.rig.head import HeadRig
 
 HOLD_OUT_EVERY = 10  # of a video every tenth frame and the last tenth are never trained on

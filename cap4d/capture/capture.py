@@ -22,8 +22,8 @@ from cap4d.camera import Camera, head_fixed
 from cap4d.capture.image import IMAGE_SUFFIXES, composite, read_image
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError, DataError
+from cap4d.rig.flame import RELEASED_RIG
 
-RELEASED_RIG = "flame2023_no_jaw"  # the rig of a fit.npz that names none: those of the released system
 POSE_FIELDS = ("rot", "tra", "eye_rot", "neck_rot", "jaw_rot")
 OPTIONAL_POSE_FIELDS = ("neck_rot", "jaw_rot")
 MAX_FRAMES = 1_000_000

@@ -11,13 +11,12 @@ import numpy as np
 from cap4d.bundle.bundle import Bundle
 from cap4d.drive.clip import Clip
 from cap4d.errors import DataError
+from cap4d.rig.flame import RELEASED_RIG
 from cap4d.rig.npz import checked, read_npz
 
 MAX_BYTES = 1 << 29  # unpacked
 MAX_FRAMES = 200_000
 DEFAULT_FPS = 24.0  # of a sequence that names none (fact 46)
-FLAME = "flame"  # how the names of FLAME's rigs begin
-FLAME_EXPRESSIONS = 65  # of a sequence that names no rig (fact 3)
 
 
 def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
@@ -67,8 +66,8 @@ BROKEN_ARCHIVE = (
 
 def _check_rig(path: Path, arrays: dict[str, np.ndarray], bundle: Bundle) -> None:
     if "rig_name" not in arrays:
-        if not (bundle.rig_name.startswith(FLAME) and bundle.n_expressions == FLAME_EXPRESSIONS):
-            found = f"none, so FLAME with {FLAME_EXPRESSIONS} expressions"
+        if bundle.rig_name != RELEASED_RIG:
+            found = f"none, so {RELEASED_RIG!r}"
             raise DataError(path, "rig_name", expected=repr(bundle.rig_name), found=found)
         return
     name = str(checked(path, "rig_name", arrays["rig_name"], kind="text", shape=()))

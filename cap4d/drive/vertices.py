@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cap4d.bundle.bundle import Bundle
-from cap4d.drive.fit import BROKEN_ARCHIVE, FLAME, MAX_FRAMES, read_arrays
+from cap4d.drive.fit import BROKEN_ARCHIVE, MAX_FRAMES, read_arrays
 from cap4d.errors import ArgumentError, DataError
 from cap4d.rig.npz import checked, read_npy
 
@@ -19,7 +19,7 @@ MAX_TEMPLATE_BYTES = 64 << 20
 
 def expected_vertices(bundle: Bundle) -> int:
     """Vertices of a frame for this avatar: FLAME's own for a FLAME rig (without CAP4D's mouth, fact 14)."""
-    return FLAME_VERTICES if bundle.rig_name.startswith(FLAME) else bundle.rig_vertices
+    return FLAME_VERTICES if bundle.rig_name.startswith("flame") else bundle.rig_vertices
 
 
 def read_vertices(path: Path, count: int) -> np.ndarray:

@@ -35,6 +35,7 @@ JOINTS = {"neck": (0, "neck"), "jaw": (2, "jaw"), "eye_left": (3, "eyes"), "eye_
 N_RINGS, N_AROUND, N_LATITUDES = 10, 20, 20
 N_MOUTH = N_RINGS * N_AROUND
 
+RELEASED_RIG = "flame2023_no_jaw"  # the rig of the released system, and of its files that name none
 EDITIONS_WITH_JAW = {
     "generic_model": "flame2020",
     "flame2020": "flame2020",
@@ -70,9 +71,9 @@ class FlameModel:
 def import_flame(model: Path, assets: Path | None = None, *, compat_pose_offset: bool = True) -> HeadRig:
     """Makes a rig of a FLAME pickle.
 
-    The rig is named after the file (`generic_model.pkl` is FLAME 2020). For the editions with a jaw of their
-    own the lower mouth turns with `jaw_rot`; for `flame2023_no_jaw` and others it turns with the expression
-    (fact 13).
+    Editions with a jaw of their own are known by their files' names (`generic_model.pkl` is FLAME 2020); there
+    the lower mouth turns with `jaw_rot`. Any other model with the released assets, whatever its file is called,
+    is `flame2023_no_jaw`, where it turns with the expression (fact 13).
 
     Args:
         model: FLAME's .pkl.
@@ -85,7 +86,8 @@ def import_flame(model: Path, assets: Path | None = None, *, compat_pose_offset:
     """
     model, stem = Path(model), Path(model).stem
     flame = read_flame(model)
-    rig = _bare_rig(flame, EDITIONS_WITH_JAW.get(stem, stem), compat_pose_offset)
+    name = EDITIONS_WITH_JAW.get(stem, stem if assets is None else RELEASED_RIG)
+    rig = _bare_rig(flame, name, compat_pose_offset)
     if assets is None:
         return rig
     return _with_assets(rig, read_assets(Path(assets), flame.faces), flame, own_jaw=stem in EDITIONS_WITH_JAW)

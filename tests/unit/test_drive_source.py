@@ -97,7 +97,7 @@ def test_a_released_fit_names_no_rig_and_means_flame(flame: Bundle, bundle: Bund
     spec = fit(tmp_path / "fit.npz", rig_name=None, expr=np.ones((T, 65), np.float32))
     assert open_source(spec, flame).expr.shape == (T, 65)
     error = refused(spec, bundle)
-    assert error.field == "rig_name" and "FLAME" in error.found and "tiny" in error.expected
+    assert error.field == "rig_name" and "flame2023_no_jaw" in error.found and "tiny" in error.expected
 
 
 def broken_archive(path: Path) -> str:

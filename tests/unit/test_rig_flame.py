@@ -99,6 +99,7 @@ def test_constant_pose_offset_of_fact_8(rig, content, shared):
 def test_counts(rig):
     assert len(rig.template) == 5423 and len(rig.faces) == 10656 and len(rig.uvs) == 5462  # fact 14
     assert (rig.n_identity, rig.n_expressions, rig.expression_names[BLINK]) == (150, 65, "blink")
+    assert rig.name == "flame2023_no_jaw"  # by what it is, not by its file's name
     assert (len(rig.regions["head"]), len(rig.regions["deformable"])) == (4783, 4922)  # fact 15
     grid = build_grid(rig)
     assert (len(grid), len(grid.faces), grid.deformable.sum()) == (14425, 28120, 8424)
