@@ -18,6 +18,7 @@ from cap4d.capture.capture import Capture
 from cap4d.drive.clip import Clip
 from cap4d.rotation import axis_angle_to_rotmat, rotmat_to_axis_angle
 
+FADE_FRAMES = 3.0  # how far a residual reaches beyond the trained frames
 KERNEL_FRAMES = 1.0  # standard deviation of the residual's smoothing, in frames
 POSE_FIELDS = ("rot", "tra", "expr", "eye_rot", "neck_rot")
 EXPECTED_SIZE = {"rot": 0.01, "tra": 2e-3, "expr": 0.05, "eye_rot": 0.03, "neck_rot": 0.03}
@@ -114,10 +115,11 @@ def _features(capture: Capture, trained: np.ndarray) -> np.ndarray:
 def _smoothing(trained: np.ndarray) -> np.ndarray:
     """float32[T, K]: each frame's weights over the K trained frames, a normalised Gaussian in time.
 
-    Far from any trained frame the nearest one's residual is held.
+    Away from the trained frames the nearest one's residual fades to none: the tracker's errors do not last.
     """
     times = np.arange(len(trained), dtype=np.float64)
     distance2 = (times[:, None] - times[trained]) ** 2
     exponent = -(distance2 - distance2.min(1, keepdims=True)) / (2 * KERNEL_FRAMES**2)
     weights = np.exp(exponent)
-    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+    fade = np.exp(-distance2.min(1, keepdims=True) / (2 * FADE_FRAMES**2))
+    return (fade * weights / weights.sum(1, keepdims=True)).astype(np.float32)

@@ -31,7 +31,7 @@ from cap4d.rig.head import HeadRig
 log = logging.getLogger(__name__)
 
 ABLATIONS = (None, "unet")
-PAINT_VIEWS = 8
+PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
 
 

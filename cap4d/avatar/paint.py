@@ -1,4 +1,8 @@
-"""First colours for the Gaussians, seen in the images through the surface: a start for short fits."""
+"""First colours for the Gaussians, seen in the images through the surface: a start for short fits.
+
+It also settles what no image will: triangles that no view sees would stay faint and grey, and a camera that
+moves around the head would look through them. They begin as opaque flakes coloured as the nearest seen ones.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +17,52 @@ from cap4d.avatar.views import FitView
 from cap4d.mesh import rasterize_mesh
 
 SH_C0 = 0.28209479177387814  # of the constant harmonic, 1 / (2 sqrt(pi))
-MIN_COVERAGE = 0.9  # pixels that the matte gives to the background for more than a tenth are not looked at
+MIN_COVERAGE = 0.9  # of the person in a pixel's matte, to be looked at
+FINER = 3  # the mesh is drawn this many times larger: eyelids have triangles smaller than a pixel
+NEIGHBOURS = 12
+FLAKE = (0.7, 0.15, 0.7)  # local scales; the second axis is the triangle's normal (fact 27)
+FLAKE_OPACITY = 0.9
 
 
 def paint(model: AvatarModel, views: Sequence[FitView], poses: Sequence[Pose]) -> None:
-    """Sets the DC colour of every Gaussian to what the views show of its triangle.
+    """Sets the DC colour of all Gaussians, and shape and opacity of those on triangles that no view sees.
 
-    Triangles that no view sees take the colour of the nearest one that is seen.
     Args:
-        views, poses: A handful of images and what drives the avatar in them.
+        views, poses: Some images and what drives the avatar in them.
     """
-    faces = model.grid.faces
-    total, pixels = np.zeros((len(faces), 3)), np.zeros(len(faces))
+    total, pixels = np.zeros((len(model.faces), 3)), np.zeros(len(model.faces))
     for view, pose in zip(views, poses, strict=True):
-        vertices = model.surface(pose).numpy()
-        seen = rasterize_mesh(vertices, faces, view.camera).face
-        hit = seen >= 0
-        if view.coverage is not None:
-            hit &= view.coverage.float().numpy() > MIN_COVERAGE
-        np.add.at(total, seen[hit], view.target.numpy()[hit])
-        np.add.at(pixels, seen[hit], 1)
-    if not pixels.any():
+        _look(model, view, pose, total, pixels)
+    seen = pixels > 0
+    if not seen.any():
         return
     colours = total / np.maximum(pixels, 1)[:, None]
-    centres = vertices[faces].mean(1)
-    known = pixels > 0
-    nearest = cKDTree(centres[known]).query(centres[~known])[1]
-    colours[~known] = colours[known][nearest]
-    dc = torch.from_numpy((colours - 0.5) / SH_C0).float()
-    model.gaussians["sh_dc"].data = dc[model.binding][:, None].clone()
+    centres = model.subject.neutral.numpy()[model.grid.faces].mean(1)
+    k = min(NEIGHBOURS, int(seen.sum()))
+    near = cKDTree(centres[seen]).query(centres[~seen], k=k)[1].reshape(-1, k)
+    colours[~seen] = np.median(colours[seen][near], 1)
+    binding = model.binding.long()
+    model.gaussians["sh_dc"].data = torch.from_numpy((colours - 0.5) / SH_C0).float()[binding][:, None]
+    _make_flakes(model, torch.from_numpy(~seen)[binding])
+
+
+def _look(model: AvatarModel, view: FitView, pose: Pose, total: np.ndarray, pixels: np.ndarray) -> None:
+    """Adds what one view sees of each triangle to `total` [M, 3] and `pixels` [M]."""
+    camera = view.camera.resized(FINER * view.camera.width, FINER * view.camera.height)
+    face = rasterize_mesh(model.surface(pose).numpy(), model.grid.faces, camera).face
+    image = view.target.numpy().repeat(FINER, 0).repeat(FINER, 1)
+    hit = face >= 0
+    if view.coverage is not None:
+        hit &= view.coverage.float().numpy().repeat(FINER, 0).repeat(FINER, 1) > MIN_COVERAGE
+    np.add.at(total, face[hit], image[hit])
+    np.add.at(pixels, face[hit], 1)
+
+
+def _make_flakes(model: AvatarModel, rows: torch.Tensor) -> None:
+    """Lays Gaussians bool[N] flat and opaque on their triangles, together about as large as those."""
+    local = {name: value.data for name, value in model.gaussians.items()}
+    binding = model.binding.long()
+    crowd = torch.bincount(binding, minlength=len(model.faces))[binding][rows].float()
+    local["means"][rows] *= torch.tensor([1.0, 0.0, 1.0])
+    local["log_scales"][rows] = torch.tensor(FLAKE).log() - 0.5 * crowd.log()[:, None]
+    local["opacity_logits"][rows] = torch.logit(torch.tensor(FLAKE_OPACITY))

@@ -97,12 +97,12 @@ class Preset:
 
 
 SHORT_RATES = LearningRates(
-    means=(1e-2, 5e-4),
-    sh_dc=(2e-2, 1e-3),
-    sh_rest=(1e-3, 1e-4),
+    means=(2e-2, 1e-3),
+    sh_dc=(4e-2, 2e-3),
+    sh_rest=(2e-3, 1e-4),
     opacity=(0.05, 0.01),
-    scale=(1e-2, 1e-3),
-    rotation=(5e-3, 5e-4),
+    scale=(3e-2, 3e-3),
+    rotation=(1e-2, 1e-3),
     deformer=(3e-4, 1e-5),
     deformer_decay=0.0,
 )
@@ -110,26 +110,26 @@ SHORT_RATES = LearningRates(
 PRESETS = {
     "debug": Preset(
         name="debug",
-        iterations=400,
+        iterations=500,
         image_size=256,
         deformer_width=16,
         gaussians=30_000,
         per_face=1,
         sh_degree=0,
         sh_every=1000,
-        densify=Densify(start=150, stop=320, every=80, most=40_000),
+        densify=Densify(start=100, stop=400, every=50, most=50_000, split_scale=0.003),
         rates=SHORT_RATES,
     ),
     "low": Preset(
         name="low",
-        iterations=6_000,
+        iterations=8_000,
         image_size=256,
-        deformer_width=32,
+        deformer_width=16,
         gaussians=40_000,
         per_face=1,
         sh_degree=1,
-        sh_every=1000,
-        densify=Densify(start=500, stop=4_500, every=250, most=60_000),
+        sh_every=2000,
+        densify=Densify(start=400, stop=6_000, every=200, most=90_000, split_scale=0.003),
         rates=SHORT_RATES,
     ),
 }

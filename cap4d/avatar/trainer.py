@@ -33,6 +33,9 @@ from cap4d.raster import Rasterized, rasterize
 ROTATION_EVERY = 4  # steps: the term is slow and smooth, so it comes in now and then with as much more weight
 WHITE = (1.0, 1.0, 1.0)
 ADAM_EPS = 1e-15  # fact 36; gradients of a mean over pixels are tiny
+GAUSSIAN_EPS = (
+    1e-8  # visible Gaussians' gradients are 100 times larger; hidden ones must not dance to their noise
+)
 
 
 class Trainer:
@@ -79,10 +82,14 @@ class Trainer:
         self._refine()
         return loss.item()
 
-    def render(self, view: FitView) -> tuple[Posed, Rasterized]:
-        """The avatar as it should look in a view, with the corrections of its frame."""
+    def posed(self, view: FitView) -> Posed:
+        """The avatar as it stands in a view, with the corrections of its frame."""
         corrected = self.corrections[view.capture].at(view.frame)
-        posed = self.model.pose(corrected.pose, rigid=corrected.rigid)
+        return self.model.pose(corrected.pose, rigid=corrected.rigid)
+
+    def render(self, view: FitView) -> tuple[Posed, Rasterized]:
+        """The avatar as it should look in a view."""
+        posed = self.posed(view)
         rendered = rasterize(
             posed.means,
             posed.quats,
@@ -196,7 +203,9 @@ def _optimizer(model: AvatarModel, corrections: nn.ModuleList, preset: Preset) -
         "quats": r.rotation,
     }
     groups: list[dict[str, Any]] = [
-        {"params": [model.gaussians[n]], "ends": e} for n, e in ends.items() if model.gaussians[n].numel()
+        {"params": [model.gaussians[n]], "ends": e, "eps": GAUSSIAN_EPS}
+        for n, e in ends.items()
+        if model.gaussians[n].numel()
     ]
     groups.append({"params": list(corrections.parameters()), "ends": r.correction})
     if model.deformer is not None:
