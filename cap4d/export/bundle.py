@@ -71,7 +71,7 @@ def make_bundle(model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Cli
         sh=np.concatenate([local["sh_dc"], local["sh_rest"]], 1),
         binding=model.binding.numpy().astype(np.int32),
         camera=camera,
-        idle=idle_clip(clip, rig.expression_names),
+        idle=idle_clip(clip, rig),
         preview=preview(model, clip, camera),
         mesh_subject=mesh_subject,
     )

@@ -1,6 +1,4 @@
-"""What an avatar does when nothing drives it: a few seconds of its own capture, or a calm face that
-blinks.
-"""
+"""What an avatar does when nothing drives it: some seconds of its own capture, or an invented performance."""
 
 from __future__ import annotations
 
@@ -9,29 +7,32 @@ from dataclasses import replace
 import numpy as np
 
 from cap4d.drive.clip import Clip
+from cap4d.rig.head import HeadRig
+from cap4d.synth.idle import idle_clip as invented_clip
 
 LONGEST, SHORTEST = 8.0, 1.5  # s
 SEAM = 0.5  # s over which the end of the clip turns into its beginning
-STILL_SECONDS, STILL_FPS = 6.0, 30.0
-BLINKS = (1.2, 4.1)  # s
-BLINK_SECONDS = 0.3
-BLINK_NAMES = ("eyeBlinkLeft", "eyeBlinkRight", "eyeBlink_L", "eyeBlink_R", "blink")
 FIELDS = ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra")
 
 
-def idle_clip(clip: Clip, expression_names: tuple[str, ...]) -> Clip:
-    """A clip that can repeat: from the capture's own where that is a film, else a still of its calmest
-    frame.
+def idle_clip(clip: Clip, rig: HeadRig) -> Clip:
+    """A clip that can repeat: from the capture's own where that is a film, else an invented one.
+
+    The invented one keeps the head where the capture's calmest frame has it.
     """
     if clip.duration >= SHORTEST and is_film(clip):
         return looped(clip)
-    return still(clip, int(np.abs(clip.expr).sum(1).argmin()), expression_names)
+    invented = invented_clip(rig)
+    calm = int(np.abs(clip.expr).sum(1).argmin())
+    held = {
+        name: None if (value := getattr(clip, name)) is None else np.repeat(value[[calm]], len(invented), 0)
+        for name in ("rot", "tra")
+    }
+    return replace(invented, **held)
 
 
 def is_film(clip: Clip) -> bool:
-    """Whether its frames follow each other in time: then a frame resembles the next one more than any
-    other.
-    """
+    """Whether its frames follow each other in time: a frame then resembles the next more than any other."""
     spread = np.abs(clip.expr - clip.expr.mean(0)).sum()
     return float(np.abs(np.diff(clip.expr, axis=0)).sum()) < 0.5 * spread
 
@@ -39,8 +40,7 @@ def is_film(clip: Clip) -> bool:
 def looped(clip: Clip) -> Clip:
     """The clip's first seconds without its first half second, into which the end is blended instead.
 
-    So the last frame precedes the first one. Rotations within a clip differ little and are blended as
-    vectors.
+    So the last frame precedes the first. Rotations within a clip differ little and are blended as vectors.
     """
     frames = min(len(clip), round(LONGEST * clip.fps))
     seam = min(round(SEAM * clip.fps), frames // 3)
@@ -54,20 +54,3 @@ def looped(clip: Clip) -> Clip:
         return loop
 
     return replace(clip, **{name: blend(getattr(clip, name)) for name in FIELDS})
-
-
-def still(clip: Clip, frame: int, expression_names: tuple[str, ...]) -> Clip:
-    """One frame of the clip held for six seconds, with two blinks where the rig can blink."""
-    frames = round(STILL_SECONDS * STILL_FPS)
-    held = {
-        name: None if (v := getattr(clip, name)) is None else np.repeat(v[frame : frame + 1], frames, 0)
-        for name in FIELDS
-    }
-    lids = [i for i, name in enumerate(expression_names) if name in BLINK_NAMES]
-    time = np.arange(frames) / STILL_FPS
-    closed = sum(
-        np.maximum(0, np.cos(np.pi * np.clip((time - t) / BLINK_SECONDS, -0.5, 0.5))) for t in BLINKS
-    )
-    expr = held["expr"].astype(np.float32)
-    expr[:, lids] = np.maximum(expr[:, lids], closed[:, None])
-    return replace(clip, fps=STILL_FPS, **(held | {"expr": expr}))
