@@ -1,8 +1,8 @@
-"""Small learned corrections of what the tracker measured: head pose, expression, eyes, neck, and exposure.
+"""Small learned corrections of what the tracker measured: head pose, expression, eyes, neck.
 
 A correction is a function of the tracked sequence, never of one image alone: a linear map of the tracked
 parameters plus a residual that is smooth in time. Frames without a training image (held out, or in between)
-therefore get the correction of their neighbours, and their own image never enters.
+therefore get the correction of their neighbours; their own image enters only through the tracker.
 """
 
 from __future__ import annotations
@@ -45,9 +45,10 @@ class Corrections(nn.Module):
         capture: Its tracked parameters are the starting point.
         trained: bool[T] frames with a training image.
         pivot: [3] m, head-fixed frame: rotations are corrected about it, so that they do not also translate.
+        video: Whether neighbouring frames are moments apart; stills share no residual.
     """
 
-    def __init__(self, capture: Capture, trained: np.ndarray, pivot: np.ndarray) -> None:
+    def __init__(self, capture: Capture, trained: np.ndarray, pivot: np.ndarray, *, video: bool) -> None:
         super().__init__()
         self.n_expr = capture.expr.shape[1]
         tracked = {
@@ -56,7 +57,7 @@ class Corrections(nn.Module):
         for name, value in tracked.items():
             self.register_buffer(name, value, persistent=False)
         self.register_buffer("features", torch.from_numpy(_features(capture, trained)), persistent=False)
-        self.register_buffer("kernel", torch.from_numpy(_smoothing(trained)), persistent=False)
+        self.register_buffer("kernel", torch.from_numpy(_smoothing(trained, video)), persistent=False)
         self.register_buffer("pivot", torch.as_tensor(pivot, dtype=torch.float32), persistent=False)
         self.register_buffer("unit", _units(self.n_expr), persistent=False)
         outputs = len(self.unit)
@@ -112,11 +113,14 @@ def _features(capture: Capture, trained: np.ndarray) -> np.ndarray:
     return (np.clip(scaled, -3, 3) / np.sqrt(scaled.shape[1])).astype(np.float32)
 
 
-def _smoothing(trained: np.ndarray) -> np.ndarray:
+def _smoothing(trained: np.ndarray, video: bool) -> np.ndarray:
     """float32[T, K]: each frame's weights over the K trained frames, a normalised Gaussian in time.
 
     Away from the trained frames the nearest one's residual fades to none: the tracker's errors do not last.
+    Stills have their own residual, or none.
     """
+    if not video:
+        return np.eye(len(trained), dtype=np.float32)[:, trained]
     times = np.arange(len(trained), dtype=np.float64)
     distance2 = (times[:, None] - times[trained]) ** 2
     exponent = -(distance2 - distance2.min(1, keepdims=True)) / (2 * KERNEL_FRAMES**2)

@@ -6,6 +6,7 @@ frame) and, while the fit runs, `me.fit.ckpt`.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from cap4d.avatar.paint import paint
 from cap4d.avatar.presets import Preset, preset_named
 from cap4d.avatar.report import FitReport, compare, summarise, write_sheet
 from cap4d.avatar.trainer import Trainer
-from cap4d.avatar.views import FitView, Split, check_rig, load_views, split_views
+from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, split_views, spread
 from cap4d.camera import opencv_from_rig
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError
@@ -62,7 +63,11 @@ def fit(
     """
     if ablate not in ABLATIONS:
         raise ArgumentError(f"ablate: expected unet, got {ablate!r}")
+    if not output.parent.is_dir() or output.is_dir():
+        raise ArgumentError(f"output: expected a file in a folder that exists, got {output}")
     settings = preset_named(preset) if isinstance(preset, str) else preset
+    if settings.weights.lpips > 0:
+        raise ArgumentError("lpips: expected 0, this build has no LPIPS term")
     started = time.monotonic()
     loaded = [Capture.load(path) for path in captures]
     for capture in loaded:
@@ -70,7 +75,8 @@ def fit(
     split = split_views(loaded, load_views(loaded, settings.image_size))
     trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed)
     checkpoint = output.with_suffix(".fit.ckpt")
-    kind = f"preset {settings.name}, rig {rig.name}, {len(split.train)} frames, ablate {ablate}, seed {seed}"
+    data = fingerprint(captures, settings)
+    kind = f"preset {settings.name}, rig {rig.name}, ablate {ablate}, seed {seed}, data {data}"
     spent = 0.0
     if resume and checkpoint.exists():
         state = load_checkpoint(checkpoint, kind=kind)
@@ -113,12 +119,22 @@ def prepare(
         generator=generator,
     )
     pivot = opencv_from_rig(model.subject.neutral.mean(0)).numpy()
-    corrections = [Corrections(c, _trained(i, c, split.train), pivot) for i, c in enumerate(captures)]
+    corrections = [
+        Corrections(c, _trained(i, c, split.train), pivot, video=is_video(c)) for i, c in enumerate(captures)
+    ]
     if preset.paint:
-        some = split.train[:: max(1, len(split.train) // PAINT_VIEWS)]
+        some = spread(split.train, PAINT_VIEWS)
         with torch.no_grad():
             paint(model, some, [corrections[v.capture].at(v.frame).pose for v in some])
     return Trainer(model, corrections, split.train, preset, seed=seed)
+
+
+def fingerprint(captures: Sequence[Path], settings: Preset) -> str:
+    """Twelve hex digits that change with the settings and with what was tracked: whose checkpoint it is."""
+    digest = hashlib.sha256(repr(settings).encode())
+    for path in captures:
+        digest.update((path / "fit.npz").read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def run(trainer: Trainer, save) -> None:

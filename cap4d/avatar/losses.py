@@ -31,8 +31,7 @@ class LossWeights:
         laplacian: Roughness of the deformation map.
         deformation: Size of its expression-dependent part.
         rotation: Turning of the triangles by that part.
-        neck: Learned neck offsets.
-        pose: Learned corrections of head pose, expression and eyes.
+        pose: Learned corrections of head pose, expression, eyes and neck.
     """
 
     l1: float = 0.6
@@ -46,7 +45,6 @@ class LossWeights:
     laplacian: float = 1.0
     deformation: float = 0.4
     rotation: float = 0.005
-    neck: float = 1.0
     pose: float = 1.0
 
 

@@ -2,7 +2,10 @@
 
 The released system's schedules (fact 37) run 25k to 100k steps on a GPU. A short schedule needs larger steps:
 learning rates here are the released ones (fact 36) times what the shorter road asks for, decayed log-linearly
-as there.
+as there. Other differences from the released system, each for a short fit on a CPU: narrower networks without
+weight decay (fact 36), Adam's eps of 1e-8 for Gaussians (fact 36: 1e-15), growth by the largest gradients up
+to a given number instead of by a threshold alone, no opacity resets (fact 37), a matte term, and at least one
+Gaussian a triangle (fact 29: two).
 """
 
 from __future__ import annotations

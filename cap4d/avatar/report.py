@@ -14,22 +14,26 @@ import torch
 
 from cap4d.atomic import replacing
 from cap4d.avatar.trainer import Trainer
-from cap4d.avatar.views import FitView, Split
+from cap4d.avatar.views import FitView, Split, spread
 from cap4d.capture.image import write_image
 from cap4d.evaluate.image import mse, pooled_psnr, psnr_of_mse, ssim
 
 SHEET_ROWS = 6
+TRAIN_VIEWS = 16  # training frames that train_psnr looks at
+LEAST_MSE = 1e-10  # a frame repeated to the bit counts as 100 dB, not as infinity
 
 
 @dataclass(frozen=True)
 class FitReport:
     """The numbers of a fit, as they are written to `.fit.json`. PSNRs in dB; None where no frame is held out.
 
+    The fit never sees a held-out image. Its expression, gaze, pose and matte come from the tracker, which saw
+    all frames, as in the field's usual protocol; so do the identity and the focal length.
+
     Args:
         held_out_psnr: Of the squared error pooled over all pixels of all held-out frames.
         nearest_frame_psnr: The same for the baseline: for every held-out frame the training frame of the same
-            size and camera that resembles it most (least squared error, so it is the best that replaying
-            could do).
+            size that resembles it most (least squared error, so it is the best that replaying could do).
         nearest_in_time_psnr: The same for the training frame nearest in time.
         held_out_psnr_mean, nearest_frame_psnr_mean: Means of the frames' own PSNRs.
         held_out_ssim: Mean SSIM.
@@ -70,6 +74,7 @@ class Comparison:
     Args:
         truth, ours, nearest: float32[H, W, 3] per frame.
         errors: {"ours", "nearest", "time"} -> float64[K] mean squared errors.
+        pixels: float64[K] pixels of the frames, which weight their errors in a pool.
         ssim: float64[K] of ours.
         tail: bool[K] frames after the last training frame.
     """
@@ -78,6 +83,7 @@ class Comparison:
     ours: list[np.ndarray]
     nearest: list[np.ndarray]
     errors: dict[str, np.ndarray]
+    pixels: np.ndarray
     ssim: np.ndarray
     tail: np.ndarray
 
@@ -86,11 +92,12 @@ class Comparison:
         if not mask.any():
             return {}
         e = {name: values[mask] for name, values in self.errors.items()}
+        share = self.pixels[mask] / self.pixels[mask].mean()
         return {
             "frames": int(mask.sum()),
-            "held_out_psnr": pooled_psnr(e["ours"]),
-            "nearest_frame_psnr": pooled_psnr(e["nearest"]),
-            "nearest_in_time_psnr": pooled_psnr(e["time"]),
+            "held_out_psnr": pooled_psnr(share * e["ours"]),
+            "nearest_frame_psnr": pooled_psnr(share * e["nearest"]),
+            "nearest_in_time_psnr": pooled_psnr(share * e["time"]),
             "held_out_psnr_mean": _mean_psnr(e["ours"]),
             "nearest_frame_psnr_mean": _mean_psnr(e["nearest"]),
             "held_out_ssim": float(self.ssim[mask].mean()),
@@ -109,11 +116,12 @@ def compare(trainer: Trainer, split: Split) -> Comparison:
     truth = [view.target.numpy() for view in split.held_out]
     by_pixels, by_time = zip(*(_baselines(view, split.train) for view in split.held_out), strict=True)
     errors = {
-        name: np.array([mse(a, b) for a, b in zip(images, truth, strict=True)])
+        name: np.array([max(LEAST_MSE, mse(a, b)) for a, b in zip(images, truth, strict=True)])
         for name, images in (("ours", ours), ("nearest", by_pixels), ("time", by_time))
     }
     similar = np.array([ssim(a, b) for a, b in zip(ours, truth, strict=True)])
-    return Comparison(truth, ours, list(by_pixels), errors, similar, split.tail)
+    pixels = np.array([image.size for image in truth], np.float64)
+    return Comparison(truth, ours, list(by_pixels), errors, pixels, similar, split.tail)
 
 
 def _baselines(view: FitView, train: Sequence[FitView]) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +146,7 @@ def summarise(
     if comparison is not None:
         everything = comparison.summary(np.ones_like(comparison.tail))
         between, tail = comparison.summary(~comparison.tail), comparison.summary(comparison.tail)
-    some = split.train[:: max(1, len(split.train) // 16)]
+    some = spread(split.train, TRAIN_VIEWS)
     pictures = render_views(trainer, some)
     train_errors = np.array([mse(a, v.target.numpy()) for a, v in zip(pictures, some, strict=True)])
     names = ("held_out_psnr", "nearest_frame_psnr", "nearest_in_time_psnr", "held_out_psnr_mean")

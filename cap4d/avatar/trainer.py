@@ -123,8 +123,8 @@ class Trainer:
         loss = loss + w.deformation * relative_deformation_loss(d.moved, d.neutral)
         if self.step % ROTATION_EVERY:
             return loss
-        turned, neutral = (triangle_frames(posed.surface + x, self.faces)[1] for x in (d.moved, d.neutral))
-        return loss + ROTATION_EVERY * w.rotation * relative_rotation_loss(turned, neutral)
+        turning = rotation_term(posed.surface, d.moved, d.neutral, self.faces)
+        return loss + ROTATION_EVERY * w.rotation * turning
 
     def _refine(self) -> None:
         d = self.preset.densify
@@ -190,6 +190,17 @@ class Trainer:
         self.rows = Rows(self.model, self.optimizer)
         self.evidence = Evidence(len(self.model))
         self.evidence.gradient, self.evidence.seen, self.evidence.radius = state["evidence"]
+
+
+def rotation_term(
+    surface: torch.Tensor, moved: torch.Tensor, neutral: torch.Tensor, faces: torch.Tensor
+) -> torch.Tensor:
+    """How far the deformation turns the triangles beyond what it does to them at rest (fact 35).
+
+    In double: torch sums float gradients of gathered vertices in an order that depends on its threads.
+    """
+    turned, still = (triangle_frames((surface + x).double(), faces)[1] for x in (moved, neutral))
+    return relative_rotation_loss(turned, still)
 
 
 def _optimizer(model: AvatarModel, corrections: nn.ModuleList, preset: Preset) -> torch.optim.Adam:

@@ -101,12 +101,23 @@ def held_out_frames(capture: Capture) -> np.ndarray:
     if capture.held_out is not None:
         return capture.held_out
     marks = np.zeros(frames, bool)
-    if len(capture.cameras) == 1 and frames >= SHORTEST_VIDEO:
+    if is_video(capture):
         marks[HOLD_OUT_EVERY - 1 :: HOLD_OUT_EVERY] = True
         marks[frames - frames // HOLD_OUT_EVERY :] = True
     elif frames >= 4:
         marks[frames - min(MOST_STILLS_HELD_OUT, max(1, frames // 10)) :] = True
     return marks
+
+
+def is_video(capture: Capture) -> bool:
+    """Whether consecutive frames are moments apart, rather than unrelated stills or generated views."""
+    return len(capture.cameras) == 1 and len(capture) >= SHORTEST_VIDEO
+
+
+def spread(views: Sequence[FitView], count: int) -> list[FitView]:
+    """At most `count` of the views, evenly over their order."""
+    picked = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
+    return [views[i] for i in picked]
 
 
 def check_rig(capture: Capture, rig: HeadRig) -> None:

@@ -258,7 +258,7 @@ class Problem:
         }
 
     def variables(self, solution: Solution) -> dict[str, torch.Tensor]:
-        x = {name: torch.as_tensor(getattr(solution, name)) for name in ("shape", "expr", "rot", "eye_rot")}
+        x = {name: torch.tensor(getattr(solution, name)) for name in ("shape", "expr", "rot", "eye_rot")}
         focal = torch.as_tensor(solution.focal)
         return x | {
             "tra": torch.as_tensor(solution.tra) / TRANSLATION_UNIT,

@@ -21,7 +21,7 @@ def capture(tmp_path_factory):
 def corrections(capture):
     trained = np.ones(len(capture), bool)
     trained[[9, 19, 22, 23]] = False
-    return Corrections(capture, trained, np.array([0.01, 0.02, 0.03]))
+    return Corrections(capture, trained, np.array([0.01, 0.02, 0.03]), video=True)
 
 
 def test_they_start_at_what_was_tracked(capture, corrections):
@@ -42,6 +42,16 @@ def test_a_held_out_frame_gets_its_neighbours_correction(corrections):
     assert 1.5 < steps[1] < 2.5
     assert steps[0] < steps[1] < steps[2]
     assert abs(steps[3]) < 1e-6
+
+
+def test_stills_share_no_residual(capture):
+    trained = np.ones(len(capture), bool)
+    trained[3] = False
+    stills = Corrections(capture, trained, np.zeros(3), video=False)
+    with torch.no_grad():
+        stills.residual[2, 6] = 1.0  # of frame 2
+        changed = [abs(float(stills.at(t).pose.expr[0] - stills.expr[t, 0])) > 1e-6 for t in range(6)]
+    assert changed == [False, False, True, False, False, False]
 
 
 def test_the_last_residual_fades_beyond_the_last_trained_frame(corrections):
