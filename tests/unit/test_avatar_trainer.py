@@ -26,7 +26,7 @@ def test_the_rotation_term_gives_the_same_gradient_bits_on_two_threads():
     torch.set_num_threads(2)
     try:
         gradients = []
-        for _ in range(5):
+        for _ in range(25):
             leaf = moved.clone().requires_grad_()
             rotation_term(surface, leaf, torch.zeros_like(leaf), faces).backward()
             gradients.append(leaf.grad)
