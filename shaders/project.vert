@@ -21,7 +21,7 @@ in uvec3 triangle;                // grid vertices
 in vec4 sh[SH_VEC4S];
 
 out vec2 mean2d;                  // px
-out vec3 conic;                   // xx, xy, yy, 1/px^2
+out vec3 conic;                   // 1/xx, xx/determinant, 1/px^2; xy/xx: see splat.frag
 out vec4 color_opacity;
 out vec4 axes;                    // half axes of the ellipse alpha = ALPHA_MIN, px; zero: culled
 
@@ -59,7 +59,7 @@ void main() {
     float opacity = mean_opacity.w;
     bool visible = view.z >= NEAR && opacity > ALPHA_MIN && footprint.determinant < INFINITE;
     mean2d = footprint.mean2d;
-    conic = vec3(covariance.z, -covariance.y, covariance.x) / footprint.determinant;
+    conic = vec3(1.0 / covariance.x, covariance.x / footprint.determinant, covariance.y / covariance.x);
     color_opacity = vec4(eval_sh(sh, normalize(mean - eye)), opacity);
     axes = visible ? cutoff_axes(covariance, footprint.determinant, opacity) : vec4(0.0);
 }

@@ -44,6 +44,31 @@ def cloud(
     return Gaussians(*(np.ascontiguousarray(x, np.float32) for x in fields))
 
 
+def needles(count: int = 6, *, sigma: float = 300.0, thickness: float = 0.3) -> tuple[Gaussians, Camera]:
+    """Diagonals across 512 px, both ways and nearly so: in float32 their conics multiplied out cancel.
+
+    Args:
+        sigma: Standard deviation along the needle, px.
+        thickness: Across it, before the low-pass, px.
+    """
+    size = 512
+    K = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
+    camera = Camera(K, np.eye(4), size, size)
+    rng = np.random.default_rng(10)
+    angles = np.pi / 4 + np.arange(count) * np.pi / 2 + rng.normal(0, 0.05, count)
+    half = angles[:, None] / 2
+    means = np.concatenate([rng.normal(0, 0.02, (count, 2)), 1 + 0.1 * np.arange(count)[:, None]], 1)
+    pixels_to_metres = means[:, 2:] / size
+    fields = (
+        means,
+        np.concatenate([np.cos(half), np.zeros((count, 2)), np.sin(half)], 1),
+        np.array([[sigma, thickness, thickness]]) * pixels_to_metres,
+        rng.uniform(0.5, 0.95, count),
+        rng.normal(0, 0.3, (count, 4, 3)),
+    )
+    return Gaussians(*(np.ascontiguousarray(x, np.float32) for x in fields)), camera
+
+
 SCENES = {
     "mixed": lambda: (cloud(), view()),
     "fine": lambda: (cloud(400, seed=1, size=0.002), view()),
@@ -55,6 +80,8 @@ SCENES = {
     "degree_0": lambda: (cloud(seed=7, degree=0), view()),
     "degree_1": lambda: (cloud(seed=8, degree=1), view()),
     "degree_2": lambda: (cloud(seed=9, degree=2), view()),
+    "needles": needles,
+    "many": lambda: (cloud(4000, seed=11, size=0.001, degree=1), view()),  # several pieces of work
 }
 
 

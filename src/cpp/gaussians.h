@@ -23,11 +23,12 @@ struct GaussianGrads {  // caller-owned outputs, shaped like the inputs; every e
 };
 
 // The image of one Gaussian: all that a pixel reads, one cache line.
-// alpha(dx, dy) = exp2(log2_opacity + a dx^2 + b dx dy + c dy^2), dx, dy = pixel centre - (x, y) in px.
+// alpha(dx, dy) = exp2(log2_opacity + a dx^2 + c (dy - shear dx)^2), dx, dy = pixel centre - (x, y) in px: a sum of squares, since
+// the same polynomial multiplied out cancels along needles and can exceed log2_opacity.
 // Where alpha >= 1/255 is an ellipse; the last five fields are its outline (see outline_span in tiles.cpp).
 struct alignas(64) Splat {
   float x, y;                   // px
-  float a, b, c, log2_opacity;  // exponent in base 2: a, c < 0
+  float a, c, shear, log2_opacity;  // exponent in base 2: a, c < 0
   float red, green, blue, depth;
   float half_height;   // px
   float slope;         // x of the chord's middle per dy
@@ -44,10 +45,11 @@ struct TileBox {
 };
 
 // Sums over the pixels of one tile (or of the image) of what one Gaussian receives.
-// s = dL/d(ln alpha) at a pixel; its moments about the mean give the gradients of position, conic and opacity.
+// s = dL/d(ln alpha) at a pixel; its moments about the mean in dx and u = dy - shear dx give the gradients of position, covariance
+// and opacity.
 struct SplatGrad {
   float red, green, blue, depth;
-  float s, sx, sy, sxx, sxy, syy;
+  float s, sx, su, sxx, sxu, suu;
 };
 
 }  // namespace cap4d

@@ -96,7 +96,7 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     const FloatV reach = 1.38629436f * (exponent - kLog2AlphaMin) + 1e-4f;
     const FloatV height2 = reach * f.yy, height = sqrt(height2), width = sqrt(reach * f.xx);
     const FloatV slope = f.xy / f.yy;
-    const FloatV finite = (f.x + f.y) * 0.0f + f.conic_a * 0.0f + f.conic_b * 0.0f + f.conic_c * 0.0f + f.det * 0.0f +
+    const FloatV finite = (f.x + f.y) * 0.0f + f.inv_xx * 0.0f + f.inv_uu * 0.0f + f.shear * 0.0f + f.det * 0.0f +
                           (height2 + width) * 0.0f + opacity * 0.0f + (shape.quat[0] + shape.quat[1]) * 0.0f;
     MaskV drawn = less_equal(splat(0.0f), finite);  // false for NaN
     drawn = both(drawn, both(less_equal(splat(kNear), f.depth), less_equal(splat(kAlphaMin), opacity)));
@@ -111,8 +111,8 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     sh_basis(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], basis_v);
     float basis[kShMax][kLanes];
     for (int k = 0; k < used; ++k) store(basis[k], basis_v[k]);
-    const FloatV fields_v[] = {f.x, f.y, f.conic_a * (-0.5f * kLog2e), f.conic_b * -kLog2e, f.conic_c * (-0.5f * kLog2e), exponent, f.depth,
-                               height, slope, f.xy / f.xx * width, f.det / f.yy * reach, 1.0f / height2, f.xx, f.xy, f.yy};
+    const FloatV fields_v[] = {f.x, f.y, f.inv_xx * (-0.5f * kLog2e), f.inv_uu * (-0.5f * kLog2e), f.shear, exponent, f.depth,
+                               height, slope, f.shear * width, f.det / f.yy * reach, 1.0f / height2, f.xx, f.xy, f.yy};
     float fields[15][kLanes];
     spread<15>(fields_v, fields);
     const TileRange columns = tile_range(f.x - width, f.x + width, camera.width), rows = tile_range(f.y - height, f.y + height, camera.height);
@@ -122,7 +122,7 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
       const Float4 color = sh_color(g.sh + 3 * g.sh_count * id, used, basis, l);
       if (!sane(color[0]) || !sane(color[1]) || !sane(color[2])) continue;
       Splat& s = splats[id];
-      s.x = fields[0][l], s.y = fields[1][l], s.a = fields[2][l], s.b = fields[3][l], s.c = fields[4][l], s.log2_opacity = fields[5][l];
+      s.x = fields[0][l], s.y = fields[1][l], s.a = fields[2][l], s.c = fields[3][l], s.shear = fields[4][l], s.log2_opacity = fields[5][l];
       s.red = std::max(color[0], 0.0f), s.green = std::max(color[1], 0.0f), s.blue = std::max(color[2], 0.0f);
       s.depth = fields[6][l], s.half_height = fields[7][l], s.slope = fields[8][l], s.y_rightmost = fields[9][l];
       s.half_width2 = fields[10][l], s.inv_height2 = fields[11][l];
@@ -139,7 +139,7 @@ CAP4D_INLINE SplatGrad total(const PairGrads& pairs, std::size_t id) {
   for (std::uint32_t k = pairs.offsets[id]; k < pairs.offsets[id + 1]; ++k) {
     const SplatGrad& v = pairs.grads[k];
     sum.red += v.red, sum.green += v.green, sum.blue += v.blue, sum.depth += v.depth;
-    sum.s += v.s, sum.sx += v.sx, sum.sy += v.sy, sum.sxx += v.sxx, sum.sxy += v.sxy, sum.syy += v.syy;
+    sum.s += v.s, sum.sx += v.sx, sum.su += v.su, sum.sxx += v.sxx, sum.sxu += v.sxu, sum.suu += v.suu;
   }
   return sum;
 }
@@ -176,7 +176,7 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     for (int l = 0; l < count; ++l) {
       if (radii[first + l] == 0) continue;
       const SplatGrad v = total(pairs, first + l);
-      const float values[10] = {v.red, v.green, v.blue, v.depth, v.s, v.sx, v.sy, v.sxx, v.sxy, v.syy};
+      const float values[10] = {v.red, v.green, v.blue, v.depth, v.s, v.sx, v.su, v.sxx, v.sxu, v.suu};
       for (int c = 0; c < 10; ++c) received[c][l] = values[c];
     }
     const Shape3<FloatV> shape = gather_shape(g, first, count);
@@ -184,9 +184,12 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     gather<1>(g.opacities, first, count, &opacity);
     const Projection<FloatV> p = project(camera, shape);
     const Footprint<FloatV>& f = p.footprint;
-    const FloatV sx = load(received[5]), sy = load(received[6]);
-    const FootprintGrad<FloatV> v = {f.conic_a * sx + f.conic_b * sy, f.conic_b * sx + f.conic_c * sy, load(received[3]),
-                                     -0.5f * load(received[7]), -load(received[8]), -0.5f * load(received[9])};
+    // d(ln density) = covariance^-1 d . d(mean) + (covariance^-1 d)^T d(covariance) (covariance^-1 d) / 2, and the inverse is diagonal
+    // in (dx, u).
+    const FloatV v_y = f.inv_uu * load(received[6]);
+    const FootprintGrad<FloatV> v = {f.inv_xx * load(received[5]) - f.shear * v_y, v_y, load(received[3]),
+                                     0.5f * f.inv_xx * f.inv_xx * load(received[7]), 0.5f * f.inv_xx * f.inv_uu * load(received[8]),
+                                     0.5f * f.inv_uu * f.inv_uu * load(received[9])};
     Shape3<FloatV> v_shape = project_vjp(camera, shape, p, v);
 
     const Direction direction = view_direction(camera, shape);

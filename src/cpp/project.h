@@ -16,13 +16,17 @@ template <class T>
 struct Footprint {
   T x, y, depth;             // px, px, m
   T xx, xy, yy;              // covariance in the image with the low-pass, px^2
-  T conic_a, conic_b, conic_c;  // its inverse: density = exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2)
+  // Its inverse as a completed square, with u = dy - shear dx: density = exp(-(inv_xx dx^2 + inv_uu u^2) / 2). A polynomial in dx
+  // and dy would cancel along needles. inv_xx = 1 / xx, inv_uu = xx / det, shear = xy / xx.
+  T inv_xx, inv_uu, shear;
   T det;
 };
 
+// xx, xu, uu: dL/d(covariance) as the symmetric matrix V of the axes (dx, u), so that dL = d(covariance of (dx, u)) : V with the
+// shear held; x and y are of the image.
 template <class T>
 struct FootprintGrad {
-  T x, y, depth, conic_a, conic_b, conic_c;
+  T x, y, depth, xx, xu, uu;
 };
 
 template <class T>
@@ -105,9 +109,8 @@ CAP4D_INLINE Projection<T> project(const Camera& camera, const Shape3<T>& g) {
   // det(m m^T) as a sum of squares (Cauchy-Binet): xx yy - xy^2 would cancel for needles.
   const T c0 = m0[1] * m1[2] - m0[2] * m1[1], c1 = m0[2] * m1[0] - m0[0] * m1[2], c2 = m0[0] * m1[1] - m0[1] * m1[0];
   const T det = c0 * c0 + c1 * c1 + c2 * c2 + kLowPass * (xx + yy) + kLowPass * kLowPass;
-  const T inverse_det = 1.0f / det;
-  p.footprint = {position[0], position[1], p.view[2], xx + kLowPass, xy, yy + kLowPass,
-                 (yy + kLowPass) * inverse_det, -xy * inverse_det, (xx + kLowPass) * inverse_det, det};
+  const T wide_xx = xx + kLowPass;
+  p.footprint = {position[0], position[1], p.view[2], wide_xx, xy, yy + kLowPass, 1.0f / wide_xx, wide_xx / det, xy / wide_xx, det};
   return p;
 }
 
@@ -115,19 +118,21 @@ template <class T>
 CAP4D_INLINE Shape3<T> project_vjp(const Camera& camera, const Shape3<T>& g, const Projection<T>& p, const FootprintGrad<T>& v) {
   Shape3<T> out;
   const Footprint<T>& f = p.footprint;
-  // covariance = conic^-1: v_covariance = -conic v_conic conic. conic_b stands for both off-diagonal entries.
-  const T a = f.conic_a, b = f.conic_b, c = f.conic_c, half_b = 0.5f * v.conic_b;
-  const T t00 = a * v.conic_a + b * half_b, t01 = a * half_b + b * v.conic_c;
-  const T t10 = b * v.conic_a + c * half_b, t11 = b * half_b + c * v.conic_c;
-  const T v_xx = -(t00 * a + t01 * b), v_xy = -(t00 * b + t01 * c), v_yy = -(t10 * b + t11 * c);
   const float focal[2] = {camera.fx, camera.fy};
   const float low[2] = {camera.x_min, camera.y_min}, high[2] = {camera.x_max, camera.y_max};
   const T v_position[2] = {v.x, v.y};
   T v_m[2][3], v_q[2][3], v_rotmat[3][3];
+  const T *m0 = p.m[0], *m1 = p.m[1];
+  const T minors[3] = {m0[1] * m1[2] - m0[2] * m1[1], m0[2] * m1[0] - m0[0] * m1[2], m0[0] * m1[1] - m0[1] * m1[0]};
   for (int j = 0; j < 3; ++j) {
-    v_m[0][j] = 2.0f * (v_xx * p.m[0][j] + v_xy * p.m[1][j]);
-    v_m[1][j] = 2.0f * (v_xy * p.m[0][j] + v_yy * p.m[1][j]);
-    out.scale[j] = v_m[0][j] * p.q[0][j] + v_m[1][j] * p.q[1][j];
+    // v_m = 2 v_covariance m, all of it sheared: rows 1 of m and q less shear times rows 0, and v_m sheared back at the end.
+    // m1 - shear m0 cancels along a needle; it is (low-pass m1 + (m0 x m1) x m0) / xx.
+    const int k = (j + 1) % 3, l = (j + 2) % 3;
+    const T m_u = (kLowPass * m1[j] + (minors[k] * m0[l] - minors[l] * m0[k])) * f.inv_xx, q_u = p.q[1][j] - f.shear * p.q[0][j];
+    const T along = 2.0f * (v.xx * m0[j] + v.xu * m_u), across = 2.0f * (v.xu * m0[j] + v.uu * m_u);
+    out.scale[j] = along * p.q[0][j] + across * q_u;
+    v_m[0][j] = along - f.shear * across;
+    v_m[1][j] = across;
     for (int i = 0; i < 2; ++i) v_q[i][j] = v_m[i][j] * g.scale[j];
     for (int i = 0; i < 3; ++i) v_rotmat[i][j] = p.jacobian_view[0][i] * v_q[0][j] + p.jacobian_view[1][i] * v_q[1][j];
   }

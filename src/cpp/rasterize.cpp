@@ -89,15 +89,15 @@ CAP4D_INLINE BlockSet touched_blocks(const Splat& s, int x0, int y0) {
 }
 
 struct Contribution {  // of one Gaussian to the pixels of one block
-  FloatV dx, dy, alpha, density, weight, next;
+  FloatV dx, u, alpha, density, weight, next;
   MaskV visible, stop;
 };
 
 // False where nothing of the block is visible. `visible`: alpha >= 1/255 and the pixel open; `stop`: this one would finish it.
 CAP4D_INLINE bool contribute(const Splat& s, const TileJob& job, int block, FloatV transmittance, Contribution& c) {
   c.dx = load(kPixel.x) + (job.x0 + block_x(block) - s.x);
-  c.dy = load(kPixel.y) + (job.y0 + block_y(block) - s.y);
-  const FloatV exponent = c.dx * (s.a * c.dx + s.b * c.dy) + (s.c * c.dy * c.dy + s.log2_opacity);
+  c.u = load(kPixel.y) + (job.y0 + block_y(block) - s.y) - s.shear * c.dx;
+  const FloatV exponent = s.c * c.u * c.u + (s.a * c.dx * c.dx + s.log2_opacity);  // never above log2_opacity
   c.visible = both(less_equal(splat(kLog2AlphaMin), exponent), less(splat(0.0f), transmittance));
   if (!any(c.visible)) return false;
   c.density = exp2_nonpositive(exponent);
@@ -197,7 +197,7 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
   for (std::size_t i = 0; i < job.count; ++i) {
     const Splat& s = splat_at(job, i);
     BlockSet todo = open ? open & touched_blocks(s, job.x0, job.y0) : 0;
-    FloatV v_red{}, v_green{}, v_blue{}, v_depth{}, v_s{}, v_sx{}, v_sy{}, v_sxx{}, v_sxy{}, v_syy{};
+    FloatV v_red{}, v_green{}, v_blue{}, v_depth{}, v_s{}, v_sx{}, v_su{}, v_sxx{}, v_sxu{}, v_suu{};
     bool touched = false;
     for (; todo; todo &= todo - 1) {
       const int block = __builtin_ctzll(todo);
@@ -214,13 +214,13 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
       v_green += c.weight * grads.green[block];
       v_blue += c.weight * grads.blue[block];
       if constexpr (kDepth) v_depth += c.weight * grads.depth[block];
-      const FloatV sx = ds * c.dx, sy = ds * c.dy;
+      const FloatV sx = ds * c.dx, su = ds * c.u;
       v_s += ds;
       v_sx += sx;
-      v_sy += sy;
+      v_su += su;
       v_sxx += sx * c.dx;
-      v_sxy += sx * c.dy;
-      v_syy += sy * c.dy;
+      v_sxu += sx * c.u;
+      v_suu += su * c.u;
       grads.behind[block] = behind;
       transmittance[block] = c.next;
       if (any(c.stop) && finished(c.next)) open &= ~(BlockSet{1} << block);
@@ -232,8 +232,8 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
     }
     float sums[12];
     store4(sums, sums4(fold4(v_red), fold4(v_green), fold4(v_blue), fold4(v_depth)));
-    store4(sums + 4, sums4(fold4(v_s), fold4(v_sx), fold4(v_sy), fold4(v_sxx)));
-    store4(sums + 8, sums4(fold4(v_sxy), fold4(v_syy), Float4{}, Float4{}));
+    store4(sums + 4, sums4(fold4(v_s), fold4(v_sx), fold4(v_su), fold4(v_sxx)));
+    store4(sums + 8, sums4(fold4(v_sxu), fold4(v_suu), Float4{}, Float4{}));
     std::memcpy(&out, sums, sizeof out);
   }
 }
