@@ -151,5 +151,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 def test_threads_do_not_change_it() -> None:
-    one, many = (bind_fast(*mesh(), **local(), threads=t) for t in (1, 4))
+    """Of more faces and Gaussians than one piece of work (2048) holds."""
+    scene, gaussians = mesh(vertices=3000, faces=5000), local(count=7000, faces=5000)
+    one, many = (bind_fast(*scene, **gaussians, threads=t) for t in (1, 4))
     assert all(np.array_equal(a, b) for a, b in zip(one, many, strict=True))
