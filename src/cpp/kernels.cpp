@@ -1,7 +1,9 @@
 #include "kernels.h"
 
 #include <cstdlib>
-#include <cstring>
+#include <stdexcept>
+#include <string>
+#include <string_view>
 
 namespace cap4d {
 
@@ -20,9 +22,12 @@ extern const Kernels kKernels;
 namespace {
 
 const Kernels& choose() {
+  const char* set = std::getenv("CAP4D_ISA");
+  const std::string_view wish = set && *set ? set : "v4";
+  if (wish != "base" && wish != "v3" && wish != "v4")
+    throw std::invalid_argument("CAP4D_ISA: expected base|v3|v4, got " + std::string(wish));
 #ifdef CAP4D_HAS_X86_VARIANTS
-  const char* wish = std::getenv("CAP4D_ISA");
-  const bool no_v4 = wish && std::strcmp(wish, "v4") != 0, no_v3 = no_v4 && std::strcmp(wish, "v3") != 0;
+  const bool no_v4 = wish != "v4", no_v3 = wish == "base";
   __builtin_cpu_init();
   // By feature: GCC 11 does not know the levels by name. What else a level holds came with these.
   const bool v3_runs = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");

@@ -48,6 +48,7 @@ struct Kernels {
 };
 
 // The widest variant this processor runs; CAP4D_ISA=base|v3|v4 in the environment asks for a narrower one.
+// Throws std::invalid_argument on any other value.
 const Kernels& kernels();
 
 }  // namespace cap4d

@@ -14,6 +14,8 @@
 namespace cap4d {
 namespace {
 
+constexpr int kMaxThreads = 256;  // of one job, whoever asks: the pool's threads are never given back
+
 thread_local bool inside_job = false;
 
 struct Job {
@@ -101,15 +103,15 @@ Pool& pool() {
 int default_threads() {
   if (const char* text = std::getenv("CAP4D_THREADS")) {
     const int value = std::atoi(text);
-    if (value > 0) return std::min(value, 256);
+    if (value > 0) return std::min(value, kMaxThreads);
   }
-  return std::max(1u, std::thread::hardware_concurrency());
+  return std::clamp(static_cast<int>(std::thread::hardware_concurrency()), 1, kMaxThreads);
 }
 
 void parallel_for(std::size_t n, std::size_t grain, int threads, const std::function<void(std::size_t, std::size_t)>& body) {
   if (n == 0) return;
   grain = std::max<std::size_t>(1, grain);
-  if (threads <= 0) threads = default_threads();
+  threads = threads <= 0 ? default_threads() : std::min(threads, kMaxThreads);
   const std::size_t chunks = (n + grain - 1) / grain;
   const int helpers = static_cast<int>(std::min<std::size_t>(threads, chunks)) - 1;
   if (helpers <= 0 || inside_job) {

@@ -16,6 +16,7 @@ GRADIENT = (
 GRADIENT_FLOOR = 1e-2  # sums of large terms that cancel keep the absolute error of float32
 FINITE_DIFFERENCE = 1e-3  # relative, reference gradients against central differences in double
 ISA = 1e-5  # absolute, between instruction sets
+ISA_GRADIENT = 2e-2  # of the largest element: what one flip may change
 
 # Triangle binding, C++ (float32) against NumPy (float64), relative to the largest value.
 BIND = 2e-6
