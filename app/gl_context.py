@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 import moderngl
+
 from cap4d.errors import Cap4dError
 
 REQUIRED = 410  # OpenGL 4.1 core: macOS stops here

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
 from cap4d.app.options import Options
+
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.drive.source import open_source

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from cap4d.camera import Camera, look_at, orbit_camera
 
 MAX_PITCH_DEG = 85.0

@@ -6,9 +6,10 @@ from typing import Protocol
 
 import moderngl
 import numpy as np
-from cap4d import _core
 from cap4d.app.shader_source import build_program
 from cap4d.app.splat_pass import BoundGaussians, SplatPass
+
+from cap4d import _core
 from cap4d.bind import bind_fast
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame

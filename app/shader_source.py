@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import moderngl
 import numpy as np
+
 from cap4d.errors import Cap4dError
 
 VERSION = "#version 410 core\n"  # macOS stops here

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 from cap4d.app.shader_source import Constant, build_program
+
 from cap4d.bind import SAFE_NORM2
 from cap4d.camera import NEAR, Camera
 

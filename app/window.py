@@ -9,6 +9,7 @@ import glfw
 import moderngl
 from cap4d.app.controls import Controls, Drag
 from cap4d.app.gl_context import GlUnavailableError, window_context
+
 from cap4d.errors import Cap4dError
 
 KEYS = {
