@@ -16,12 +16,14 @@ from cap4d.app.orbit import Orbit
 from cap4d.app.play_clock import PlayClock
 from cap4d.app.renderers import WHITE, CpuRenderer, GlRenderer, Overlay, Renderer
 from cap4d.app.window import Window
+
 from cap4d.camera import Camera
 from cap4d.drive.clip import Clip, Frame
 from cap4d.drive.source import open_source
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import CameraPath, camera_path, fitted
 from cap4d.player.offline import head_centre, statistics, write_stats
+from cap4d.player.video import check_file
 
 STAGES = ("rig", "deform", "bind", "sort", "splat", "encode")
 READ_OUT_SECONDS = 0.5  # between changes of the numbers shown
@@ -34,6 +36,8 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     Raises:
         ArgumentError, DataError: The avatar or what drives it is not sound.
     """
+    if options.stats is not None:
+        check_file(options.stats, "stats")
     avatar = Avatar.load(path, deformer=options.deformer)
     clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
     avatar.check_rig(clip.rig_name)

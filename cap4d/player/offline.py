@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import CameraPath, camera_path
 from cap4d.player.stages import peak_memory_mb
-from cap4d.player.video import VideoWriter
+from cap4d.player.video import MAX_SIDE, VideoWriter, check_file, check_output
 
 log = logging.getLogger(__name__)
 
@@ -119,8 +120,13 @@ def render_to(
         ArgumentError, DataError: Before anything is written.
     """
     fps = output.fps or clip.fps
-    path = camera_path(camera, avatar.camera, head_centre(avatar), fps=fps, size=output.size)
     total = frame_count(clip, output.frames, fps)
+    if output.stats is not None:
+        check_file(output.stats, "stats")
+    path = camera_path(camera, avatar.camera, head_centre(avatar), fps=fps, size=output.size)
+    if output.path is not None:
+        view = path(0, clip.frame(0))
+        check_output(Path(output.path), fps=fps, frames=total, size=(view.width, view.height))
     images = render_clip(avatar, clip, path, frames=total, fps=fps, draw=draw)
     first = next(images)
     avatar.stages.clear()  # the first frame loads what the others find loaded
@@ -165,12 +171,13 @@ def parse_size(text: str) -> tuple[int, int]:
     """`512x384` -> (512, 384)
 
     Raises:
-        ArgumentError: Not two numbers of 1 to 16384.
+        ArgumentError: Not two numbers of 1 to `MAX_SIDE`.
     """
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and all(1 <= int(n) <= 16384 for n in (width, height))):
-        raise ArgumentError(f"size: expected WIDTHxHEIGHT in px, got {text}")
-    return int(width), int(height)
+    match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(1 <= side <= MAX_SIDE for side in size):
+        raise ArgumentError(f"size: expected WIDTHxHEIGHT, 1 to {MAX_SIDE} px each, got {text}")
+    return size
 
 
 def head_centre(avatar: Avatar) -> np.ndarray:
@@ -213,10 +220,9 @@ def write_stats(path: Path, stats: dict[str, Any]) -> None:
     """Writes the statistics as JSON, through a temporary file.
 
     Raises:
-        ArgumentError: Its folder does not exist.
+        ArgumentError: No such file can be.
     """
-    if not path.parent.is_dir():
-        raise ArgumentError(f"stats: the folder of {path} does not exist")
+    check_file(path, "stats")
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(stats, indent=1) + "\n")
 

@@ -17,7 +17,9 @@ from cap4d.player.png import write_png
 CRF = "18"  # visually lossless (the released renders use the same, fact 46)
 BT709 = 1  # ITU-T H.273: primaries, transfer and matrix
 LIMITED_RANGE = 1
-NUMBERED = re.compile(r"%0?\d*d")
+NUMBERED = re.compile(r"%0?\d?d")
+MAX_SIDE = 8192  # px, of a video; libx264 refuses 16384x16384
+MIN_FPS = 1e-3  # of a video: rates are fractions, and slower ones would become 0
 
 
 class VideoWriter:
@@ -27,15 +29,12 @@ class VideoWriter:
         path: Where to.
         fps: Frames per second of a video.
     Raises:
-        ArgumentError: Another kind of file, or its folder does not exist.
+        ArgumentError: See `check_output`.
     """
 
     def __init__(self, path: str | Path, *, fps: float) -> None:
         self.path, self.fps, self.frames = Path(path), fps, 0
-        if self.path.suffix not in (".mp4", ".png"):
-            raise ArgumentError(f"output: expected *.mp4, *.png or frame_%04d.png, got {path}")
-        if not self.path.parent.is_dir():
-            raise ArgumentError(f"output: the folder of {path} does not exist")
+        check_output(self.path, fps=fps)
         self._stack = ExitStack()
         self._container = self._stream = None
 
@@ -64,17 +63,15 @@ class VideoWriter:
         self.frames += 1
 
     def _write_png(self, image: np.ndarray) -> None:
+        check_output(self.path, fps=self.fps, frames=self.frames + 1)
         numbered = NUMBERED.search(self.path.name) is not None
-        if not numbered and self.frames:
-            raise ArgumentError(
-                f"output: expected frame_%04d.png for more than one frame, got {self.path.name}"
-            )
         write_png(self.path.with_name(self.path.name % self.frames) if numbered else self.path, image)
 
     def _write_video(self, image: np.ndarray) -> None:
         import av
         from av.video.reformatter import ColorRange, Colorspace
 
+        check_output(self.path, fps=self.fps, size=(image.shape[1], image.shape[0]))
         image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
         if self._container is None:
             self._open(image.shape[1], image.shape[0])
@@ -98,3 +95,43 @@ class VideoWriter:
         context.time_base = 1 / rate
         context.color_primaries = context.color_trc = context.colorspace = BT709
         context.color_range = LIMITED_RANGE
+
+
+def check_output(path: Path, *, fps: float, frames: int = 1, size: tuple[int, int] = (1, 1)) -> None:
+    """Refuses what cannot be written, before it is drawn.
+
+    Args:
+        path: As of `VideoWriter`.
+        fps: Frames per second of a video.
+        frames: How many there will be.
+        size: (width, height) px of each.
+    Raises:
+        ArgumentError: Another kind of file, its folder does not exist, it is a folder itself, or it cannot
+            hold so many frames, such large ones, or such slow ones.
+    """
+    check_file(path, "output")
+    if path.suffix == ".png":
+        _check_png_name(path.name, frames)
+    elif path.suffix != ".mp4":
+        raise ArgumentError(f"output: expected *.mp4, *.png or frame_%04d.png, got {path}")
+    elif max(size) > MAX_SIDE:
+        found = f"{size[0]}x{size[1]}"
+        raise ArgumentError(f"output: expected at most {MAX_SIDE} px a side for a video, got {found}")
+    elif not fps >= MIN_FPS:
+        raise ArgumentError(f"output: expected at least {MIN_FPS} frames per second of a video, got {fps:g}")
+
+
+def check_file(path: Path, what: str) -> None:
+    """Raises ArgumentError where no file `path` can be: its folder does not exist, or it is a folder."""
+    if not path.parent.is_dir():
+        raise ArgumentError(f"{what}: the folder of {path} does not exist")
+    if path.is_dir():
+        raise ArgumentError(f"{what}: expected a file, {path} is a folder")
+
+
+def _check_png_name(name: str, frames: int) -> None:
+    numbers = len(NUMBERED.findall(name))
+    if numbers > 1 or (numbers == 1 and name.count("%") > 1):
+        raise ArgumentError(f"output: expected one number such as %04d and no other %, got {name}")
+    if numbers == 0 and frames > 1:
+        raise ArgumentError(f"output: expected frame_%04d.png for more than one frame, got {name}")

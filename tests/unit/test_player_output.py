@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from tiny_bundle import tiny_bundle
+
 from cap4d.bundle import write_bundle
 from cap4d.camera import head_fixed
 from cap4d.errors import ArgumentError, DataError
@@ -21,8 +23,6 @@ from cap4d.player.offline import Output, frame_count, parse_size, render_clip, r
 from cap4d.player.png import encode_png, write_png
 from cap4d.player.stages import Stages, peak_memory_mb
 from cap4d.player.video import VideoWriter
-
-from tiny_bundle import tiny_bundle
 
 
 @pytest.fixture(scope="module")
@@ -122,10 +122,29 @@ def test_one_png_takes_one_frame(tmp_path: Path) -> None:
             video.write(picture())
 
 
-@pytest.mark.parametrize("name", ["a.gif", "a", "nowhere/a.mp4"])
+@pytest.mark.parametrize(
+    "name", ["a.gif", "a", "nowhere/a.mp4", "x%_%04d.png", "x%04d_%04d.png", "folder.png", "folder.mp4"]
+)
 def test_other_outputs_are_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(ArgumentError, match="output"):
         VideoWriter(tmp_path / name, fps=24)
+
+
+@pytest.mark.parametrize("name", ["100%.png", "100%.mp4", "f_%3d.png"])
+def test_a_name_may_hold_a_percent_sign(name: str, tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / name, fps=24) as video:
+        video.write(picture())
+    assert [p.name for p in tmp_path.iterdir()] == [name.replace("%3d", "  0")]
+
+
+def test_a_video_refuses_what_its_codec_would(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4", fps=24) as video, pytest.raises(ArgumentError, match="8192 px"):
+        video.write(np.zeros((1, 8193, 3), np.uint8))
+    with pytest.raises(ArgumentError, match="frames per second"):
+        VideoWriter(tmp_path / "a.mp4", fps=1e-5)
+    assert not list(tmp_path.iterdir())
 
 
 # Cameras
@@ -251,7 +270,7 @@ def test_render_file_is_the_whole_of_cap4d_render(tmp_path: Path) -> None:
     assert found["frames"] == 2 and sorted(p.name for p in tmp_path.glob("*.png")) == ["f_00.png", "f_01.png"]
 
 
-@pytest.mark.parametrize("size", ["512", "0x5", "axb", "5x", "-1x4", "99999x5", "1x2x3"])
+@pytest.mark.parametrize("size", ["512", "0x5", "axb", "5x", "-1x4", "99999x5", "1x2x3", "16384x16384"])
 def test_parse_size_refuses(size: str) -> None:
     with pytest.raises(ArgumentError, match="size: expected WIDTHxHEIGHT"):
         parse_size(size)
@@ -260,6 +279,29 @@ def test_parse_size_refuses(size: str) -> None:
 def test_no_frames_is_an_argument_error(avatar: Avatar) -> None:
     with pytest.raises(ArgumentError, match="frames: expected at least 1"):
         render_to(avatar, avatar.idle, "static", Output(None, frames=0))
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [
+        (Output("a.png"), "more than one frame"),
+        (Output("x%_%04d.png"), "no other %"),
+        (Output("a.mp4", stats=Path("nowhere/s.json")), "stats: the folder of nowhere/s.json does not exist"),
+        (Output("a.mp4", stats=Path(".")), "stats: expected a file, . is a folder"),
+        (Output("a.mp4", size=(16384, 16384)), "at most 8192 px"),
+        (Output("nowhere/a.mp4"), "the folder of nowhere/a.mp4 does not exist"),
+    ],
+)
+def test_what_cannot_be_written_is_not_drawn(
+    output: Output, words: str, avatar: Avatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def draw(*_: object) -> np.ndarray:
+        raise AssertionError("drew a frame")
+
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ArgumentError, match=words):
+        render_to(avatar, avatar.idle, "static", output, draw=draw)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_clip_of_another_rig_is_refused_before_anything_is_written(avatar: Avatar, tmp_path: Path) -> None:
