@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 from cap4d.bundle.bundle import Bundle
@@ -28,15 +29,18 @@ def open_source(
         bundle: The avatar.
         template: Neutral vertices of an `.npy`: `.npy`, `.npz` with key `template`, or `.obj`; without it the
             first frame is taken for neutral.
-        fps: Frames per second, overriding what the source says.
+        fps: Frames per second of the source, whatever it says itself.
     Raises:
-        ArgumentError: No such kind of source.
+        ArgumentError: No such kind of source, or a template for one that takes none.
         DataError: The file is not sound, or holds the expressions or the vertices of another rig.
     """
     if fps is not None and not 0 < fps <= 1000:
         raise ArgumentError(f"fps: expected a number in (0, 1000], got {fps}")
+    if template is not None and (spec is None or Path(spec).suffix != ".npy"):
+        found = "the idle clip" if spec is None else spec
+        raise ArgumentError(f"template: goes with vertices in an .npy only, got {found}")
     if spec is None:
-        return bundle.idle
+        return bundle.idle if fps is None else replace(bundle.idle, fps=fps)
     path = Path(spec)
     if path.suffix == ".npz":
         return read_fit(path, bundle, fps=fps)
