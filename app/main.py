@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cap4d.app.options import Options, parse_options
-from cap4d.errors import ArgumentError, exit_code
+
+from cap4d.bundle.reader import read_manifest
+from cap4d.errors import exit_code
 
 log = logging.getLogger(__name__)
 
@@ -21,10 +23,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def play(options: Options) -> None:
-    """Opens the window, or renders offline when there is to be none or can be none."""
+    """Opens the window, or renders offline when there is to be none or can be none.
+
+    Raises:
+        DataError: There is no avatar, or it is not sound.
+    """
     avatar = options.avatar if options.avatar is not None else demo_avatar()
-    if not avatar.is_file():
-        raise ArgumentError(f"avatar: expected a .cap4d file, found none at {avatar}")
+    read_manifest(avatar)  # before a window opens for what is no avatar
     if options.headless or options.out is not None or not play_in_window(avatar, options):
         from cap4d.app.headless import play_headless
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-MAX_SIDE = 8192  # px
+from cap4d.errors import ArgumentError
+
 EXAMPLES = """examples:
   cap4d-view                                   the built-in demo avatar, in a window
   cap4d-view me.cap4d                          drag turns, right drag (or shift) pans, the wheel zooms
@@ -54,27 +54,33 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("avatar", nargs="?", type=Path, metavar="AVATAR.cap4d", help="default: the built-in demo avatar")
     add("--drive", metavar="SRC", help="fit.npz or vertices .npy (default: the avatar's idle clip)")
-    add("--template", type=Path, metavar="FILE", help="neutral vertices of a .npy stream")
+    add(
+        "--template",
+        type=Path,
+        metavar="FILE",
+        help="neutral vertices for an .npy (.npy, .npz or .obj)",
+    )
     add("--fps", type=_rate, help="frames per second of the source, whatever it says itself")
     add("--backend", choices=("auto", "gl", "cpu"), default="auto", help="auto: gl where there is a GPU")
     add("--deformer", choices=("auto", "full", "off"), default="auto", help="the deformation network")
-    add("--size", type=_size, default=(512, 512), metavar="WxH", help="of window or picture (512x512)")
+    add("--size", type=_size, default=(512, 512), metavar="WxH", help="picture, or window (default: 512x512)")
     add("--headless", action="store_true", help="no window: render to --out")
     add(
         "--frames", type=_count, metavar="N", help="stop after N frames (headless: default is the clip, once)"
     )
     add("--out", metavar="FILE", help="out.mp4, frame_%%04d.png or one.png (headless: default <avatar>.mp4)")
-    add("--camera", default="static", metavar="static|orbit|FILE", help="camera path (static)")
+    add("--camera", default="static", metavar="static|orbit|FILE", help="camera path (default: static)")
     add("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
     return parser
 
 
 def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
-    size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not all(1 <= side <= MAX_SIDE for side in size):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT, 1 to {MAX_SIDE} px each, got {text}")
-    return size
+    from cap4d.player.offline import parse_size
+
+    try:
+        return parse_size(text)
+    except ArgumentError as error:
+        raise argparse.ArgumentTypeError(str(error).removeprefix("size: ")) from error
 
 
 def _count(text: str) -> int:

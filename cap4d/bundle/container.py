@@ -80,7 +80,8 @@ class Container:
     def __init__(self, path: Path, names: Collection[str]) -> None:
         self.path, self.names = path, names
         if not path.is_file():
-            raise DataError(path, "file", expected="a .cap4d file", found="no such file")
+            found = "a folder" if path.is_dir() else "no such file"
+            raise DataError(path, "file", expected="a .cap4d file", found=found)
         self.file = open(path, "rb")  # noqa: SIM115 (closed by __exit__)
         try:
             self.spans = self._read_directory()

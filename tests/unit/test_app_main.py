@@ -7,12 +7,13 @@ import pytest
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.headless import choose_backend
 from cap4d.app.main import main
+from tiny_bundle import tiny_bundle
+
+from cap4d import cli
 from cap4d.bundle import write_bundle
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import draw_on_cpu
-
-from tiny_bundle import tiny_bundle
 
 
 @pytest.fixture
@@ -78,7 +79,11 @@ def test_pictures_of_an_orbit(folder):
 @pytest.mark.parametrize(
     ("line", "code", "words"),
     [
-        ("missing.cap4d --headless", 2, "missing.cap4d"),
+        ("missing.cap4d --headless", 1, "missing.cap4d: file: expected a .cap4d file, found no such file"),
+        (". --headless", 1, "found a folder"),
+        ("tiny.cap4d --headless --template neutral.npy", 2, "template"),
+        ("tiny.cap4d --headless --out one.png", 2, "one.png"),
+        ("tiny.cap4d --headless --stats no/s.json", 2, "no/s.json"),
         ("tiny.cap4d --headless --out film.avi", 2, "film.avi"),
         ("tiny.cap4d --headless --drive nothing.wav", 2, "nothing.wav"),
         ("tiny.cap4d --headless --camera nowhere.npz", 2, "nowhere.npz"),
@@ -136,3 +141,36 @@ def test_auto_is_the_cpu_where_software_or_nothing_draws(monkeypatch, needs_gl):
     assert choose_backend("auto", avatar) == ("cpu", draw_on_cpu)
     with pytest.raises(GlUnavailableError):
         choose_backend("gl", avatar)
+
+
+@pytest.mark.parametrize("avatar", ["missing.cap4d", "."])
+def test_every_program_says_the_same_of_a_missing_avatar(folder, capsys, avatar):
+    lines = []
+    for run, words in (
+        (main, [avatar]),
+        (cli.main, ["inspect", avatar]),
+        (cli.main, ["render", avatar, "-o", "a.mp4"]),
+    ):
+        assert run(words) == 1
+        lines.append(capsys.readouterr().err.partition(": ")[2])
+    assert len(set(lines)) == 1
+    assert lines[0].startswith(f"{avatar}: file: expected a .cap4d file, found ")
+
+
+def test_render_and_view_draw_the_same_pictures(folder):
+    words = ["tiny.cap4d", "--fps", "12", "--size", "40X30", "--camera", "orbit"]
+    assert main([*words, "--headless", "--backend", "cpu", "--out", "view_%02d.png"]) == 0
+    assert cli.main(["render", *words, "-o", "render_%02d.png"]) == 0
+    names = [f"{i:02d}.png" for i in range(len(tiny_bundle().idle))]
+    for name in names:
+        assert (folder / f"view_{name}").read_bytes() == (folder / f"render_{name}").read_bytes()
+    assert len(list(folder.glob("*.png"))) == 2 * len(names)
+
+
+def test_a_rate_applies_to_the_idle_clip(folder):
+    import av
+
+    assert cli.main(["render", "tiny.cap4d", "--fps", "12", "--size", "40x30", "-o", "a.mp4"]) == 0
+    with av.open("a.mp4") as container:
+        assert container.streams.video[0].average_rate == 12
+        assert container.streams.video[0].frames == len(tiny_bundle().idle)
