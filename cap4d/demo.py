@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
+
 from cap4d import __version__
 from cap4d.errors import ArgumentError
 from cap4d.rig.head import HeadRig
@@ -17,19 +19,21 @@ from cap4d.rig.head import HeadRig
 log = logging.getLogger(__name__)
 
 SEED = 0
-VIEWS, FRAMES, SIZE = 10, 60, 256
+VIEWS, FRAMES, SIZE = 11, 60, 256  # two of the views from behind, of nine in front the fifth looks straight
+EDITION = 2  # of the avatars made here: counts up when they come out otherwise from the same material
 
 
 def demo_avatar_path() -> Path:
     """The demo's `.cap4d`, fitted to a synthetic capture of the built-in head the first time it is asked for.
 
     Raises:
-        ArgumentError: It is not there yet and the packages that fit avatars are not installed.
+        ModuleNotFoundError: It is not there yet and the packages that fit avatars are not installed.
     """
     from cap4d.rig.builtin import build_head
 
     rig = build_head()
-    path = cache_folder() / f"demo-{__version__}-{fingerprint(rig)}.cap4d"
+    key = fingerprint(VIEWS, FRAMES, SIZE, *rig_facts(rig))
+    path = cache_folder() / f"demo-{__version__}-{key}.cap4d"
     if not path.exists():
         build_demo_avatar(rig, path)
     return path
@@ -37,13 +41,9 @@ def demo_avatar_path() -> Path:
 
 def build_demo_avatar(rig: HeadRig, path: Path) -> None:
     """Synthesises a capture of `rig`, fits an avatar to it (preset `debug`) and writes it to `path`."""
-    try:
-        from cap4d.avatar.fit import fit
-        from cap4d.synth.capture import synthesize
-    except ImportError as error:
-        raise ArgumentError(
-            f"the demo avatar is built once, which needs the extra cap4d[fit] ({error})"
-        ) from error
+    from cap4d.avatar.fit import fit
+    from cap4d.synth.capture import synthesize
+
     log.info("building the demo avatar (once, a few minutes): %s", path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as folder:
@@ -53,16 +53,27 @@ def build_demo_avatar(rig: HeadRig, path: Path) -> None:
 
 
 def avatar_from_video(video: Path, rig: HeadRig, folder: Path, *, preset: str) -> Path:
-    """The whole road: video -> capture -> avatar, kept in `folder` made once."""
+    """The whole road: video -> capture -> avatar, kept in `folder`, each made once.
+
+    File names carry a fingerprint of what they are made from, so that another video, head model or preset
+    never meets the files of this one; an interrupted fit goes on where it was.
+
+    Raises:
+        ArgumentError: There is no such video.
+    """
+    if not video.exists():
+        raise ArgumentError(f"video: expected a video, found nothing at {video}")
     from cap4d.avatar.fit import fit
     from cap4d.track import track
 
     folder.mkdir(parents=True, exist_ok=True)
-    capture, avatar = folder / f"{video.stem}.capture", folder / f"{video.stem}.cap4d"
+    tracked = (*file_facts(video), *rig_facts(rig))
+    capture = folder / f"{video.stem}-{fingerprint(*tracked)}.capture"
+    avatar = folder / f"{video.stem}-{preset}-{fingerprint(*tracked, preset)}.cap4d"
     if not capture.exists():
         track(video, rig, capture)
     if not avatar.exists():
-        fit([capture], rig, avatar, preset=preset, seed=SEED)
+        fit([capture], rig, avatar, preset=preset, resume=True, seed=SEED)
     return avatar
 
 
@@ -72,8 +83,10 @@ def play(avatar: Path, folder: Path) -> int:
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32"):
         return subprocess.call(view)
     folder.mkdir(parents=True, exist_ok=True)
-    code = subprocess.call([*view, "--headless", "--camera", "orbit", "--out", str(folder / "demo.mp4")])
-    return code or subprocess.call([*view, "--headless", "--frames", "1", "--out", str(folder / "demo.png")])
+    film = [*view, "--headless", "--camera", "orbit", "--out", str(folder / "demo.mp4")]
+    # The idle clip begins awake and at rest, and the avatar's own camera looks it in the face.
+    photo = [*view, "--headless", "--camera", "static", "--frames", "1", "--out", str(folder / "demo.png")]
+    return subprocess.call(film) or subprocess.call(photo)
 
 
 def cache_folder() -> Path:
@@ -81,9 +94,22 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cap4d"
 
 
-def fingerprint(rig: HeadRig) -> str:
-    """Eight hex digits that change with the built-in head, so that a stale demo is never played."""
+def fingerprint(*facts: object) -> str:
+    """Eight hex digits that change with the facts, the version or the edition: nothing stale is played."""
+    return hashlib.sha256(repr((__version__, EDITION, SEED, *facts)).encode()).hexdigest()[:8]
+
+
+def file_facts(path: Path) -> tuple[object, ...]:
+    """Which file it is, and whether it changed."""
+    found = path.stat()
+    return str(path.resolve()), found.st_size, found.st_mtime_ns
+
+
+def rig_facts(rig: HeadRig) -> tuple[object, ...]:
+    """Which head model it is, down to its numbers."""
+    arrays = (rig.template, rig.faces, rig.identity_basis, rig.expression_basis, rig.uvs, rig.colors)
     digest = hashlib.sha256()
-    for array in (rig.template, rig.expression_basis, rig.uvs, rig.colors):
-        digest.update(array.tobytes())
-    return digest.hexdigest()[:8]
+    for array in arrays:
+        if array is not None:
+            digest.update(np.ascontiguousarray(array))
+    return rig.name, [None if a is None else a.shape for a in arrays], digest.hexdigest()
