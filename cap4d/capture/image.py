@@ -5,13 +5,12 @@ The only place that touches image files. Videos are read in track/video.py and w
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 
+from cap4d.atomic import replacing
 from cap4d.errors import ArgumentError, DataError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr"})
@@ -55,8 +54,8 @@ def write_image(path: str | Path, array: np.ndarray) -> None:
         path: The suffix names the format.
         array: float[H, W] or [H, W, C] in [0, 1] (clipped), or uint8; C of 2 and 4 end with straight alpha.
     Raises:
-        ArgumentError: The array is no image or not finite.
-        DataError: The file cannot be written, or the format holds no such image.
+        ArgumentError: The array is no image or not finite, or no file can be made at `path`.
+        DataError: The format is unknown or holds no such image, or writing fails (a full disk).
     """
     path = Path(path)
     pixels = _as_pixels(array)
@@ -65,17 +64,8 @@ def write_image(path: str | Path, array: np.ndarray) -> None:
         width, height, channels, oiio.UINT8 if path.suffix.lower() != ".exr" else oiio.FLOAT
     )
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    try:
-        handle, temporary = tempfile.mkstemp(suffix=path.suffix, prefix=f".{path.stem}.", dir=path.parent)
-    except OSError as error:
-        raise DataError(path, "folder", expected="a writable folder", found=error.strerror) from error
-    os.close(handle)
-    try:
+    with replacing(path) as temporary:
         _write_pixels(temporary, path, spec, pixels)
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def composite(image: np.ndarray, alpha: np.ndarray, background: float = 1.0) -> np.ndarray:
@@ -83,11 +73,11 @@ def composite(image: np.ndarray, alpha: np.ndarray, background: float = 1.0) -> 
     return image * alpha[..., None] + background * (1 - alpha[..., None])
 
 
-def _write_pixels(temporary: str, path: Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
-    target = oiio.ImageOutput.create(temporary)
+def _write_pixels(temporary: Path, path: Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
+    target = oiio.ImageOutput.create(str(path))  # by the suffix, which `temporary` has not
     if target is None:
         raise DataError(path, "format", expected="an image format", found=_reason(oiio.geterror()))
-    done = target.open(temporary, spec) and target.write_image(pixels) and target.close()
+    done = target.open(str(temporary), spec) and target.write_image(pixels) and target.close()
     if not done:
         raise DataError(path, "image", expected="to be written", found=_reason(target.geterror()))
 
@@ -120,9 +110,3 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def _reason(message: str) -> str:
     return " ".join(message.split()) or "an unknown error"
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

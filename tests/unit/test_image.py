@@ -73,7 +73,7 @@ def test_a_failed_write_leaves_nothing(tmp_path):
         write_image(tmp_path / "a.nonsense", np.zeros((2, 2, 3)))
     with pytest.raises(ArgumentError):
         write_image(tmp_path / "a.png", np.full((2, 2), np.nan))
-    with pytest.raises(DataError):
+    with pytest.raises(ArgumentError, match="folder does not exist"):
         write_image(tmp_path / "no" / "such" / "a.png", np.zeros((2, 2, 3)))
     assert list(tmp_path.iterdir()) == []
 
