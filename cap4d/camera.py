@@ -71,6 +71,16 @@ class Camera:
         return np.concatenate([pixels[..., :2] / view[..., 2:], view[..., 2:]], -1)
 
 
+def is_rigid(viewmat: np.ndarray) -> bool:
+    """Whether [4, 4] is a rotation (to 1e-3, no mirror) and a translation of less than 10 km; no NaN is."""
+    viewmat = np.asarray(viewmat, np.float64)
+    if not np.abs(viewmat).max() < 1e4 or viewmat[3].tolist() != [0, 0, 0, 1]:
+        return False
+    rotation = viewmat[:3, :3]
+    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+    return bool(orthonormal and np.linalg.det(rotation) > 0)
+
+
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     """[4, 4] viewmat of a camera at `eye` looking at `target` (OpenCV world, so up is -y)."""
     forward = np.asarray(target, np.float64) - eye

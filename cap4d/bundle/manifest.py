@@ -24,7 +24,7 @@ from cap4d.bundle.schema import (
     UNITS,
     VERSION,
 )
-from cap4d.camera import Camera
+from cap4d.camera import Camera, is_rigid
 from cap4d.errors import DataError
 from cap4d.gaussians import SH_COUNTS
 from cap4d.rig.head import JOINT_DRIVERS
@@ -188,9 +188,7 @@ def _camera(fields: _Fields) -> Camera:
         raise DataError(
             fields.where, "camera.K", expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", found=K.tolist()
         )
-    rotation = viewmat[:3, :3]
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
-    if not (rigid and viewmat[3].tolist() == [0, 0, 0, 1] and np.abs(viewmat).max() < 1e4):
+    if not is_rigid(viewmat):
         raise DataError(fields.where, "camera.viewmat", expected="a rigid motion", found=viewmat.tolist())
     return Camera(K, viewmat, *size)
 

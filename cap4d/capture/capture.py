@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cap4d.camera import Camera, head_fixed
+from cap4d.camera import Camera, head_fixed, is_rigid
 from cap4d.capture.image import IMAGE_SUFFIXES, composite, read_image
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError, DataError
@@ -318,6 +318,8 @@ def _cameras(fit: _Fit) -> dict[str, Camera]:
             )
         if fx[i] <= 0 or fy[i] <= 0:
             raise DataError(fit.path, "fx, fy", expected="positive focal lengths", found=f"{fx[i]}, {fy[i]}")
+        if not is_rigid(extr[i]):
+            raise DataError(fit.path, f"extr[{i}]", expected="a rigid motion", found=extr[i].tolist())
         height, width = sizes[i]
         if not (1 <= height <= 65536 and 1 <= width <= 65536):
             raise DataError(fit.path, "resolutions", expected="1 to 65536 px", found=f"{height}, {width}")

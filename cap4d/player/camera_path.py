@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cap4d.camera import Camera, head_fixed, look_at
+from cap4d.camera import Camera, head_fixed, is_rigid, look_at
 from cap4d.drive.clip import Frame
 from cap4d.drive.fit import read_arrays
 from cap4d.errors import ArgumentError, DataError
@@ -103,6 +103,9 @@ def _read_cameras(path: Path) -> list[Camera]:
     extr = checked(path, "extr", arrays.get("extr"), kind="float", shape=(None, 4, 4)).astype(np.float64)
     if not len(extr):
         raise DataError(path, "extr", expected="at least one camera", found="none")
+    for i, viewmat in enumerate(extr):
+        if not is_rigid(viewmat):
+            raise DataError(path, f"extr[{i}]", expected="a rigid motion", found=viewmat.tolist())
     focal = {
         n: checked(path, n, arrays.get(n), kind="float", shape=(len(extr), 1))
         for n in ("fx", "fy", "cx", "cy")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cap4d import ArgumentError, Camera
-from cap4d.camera import head_fixed, opencv_from_rig, orbit_camera
+from cap4d.camera import head_fixed, is_rigid, opencv_from_rig, orbit_camera
 from cap4d.rotation import axis_angle_to_rotmat
 
 ORBIT = dict(distance=1.0, target=np.array([0.0, 0.02, 0.0]), fov_y_deg=20.0, width=200, height=100)
@@ -52,3 +52,12 @@ def test_bad_cameras_are_refused() -> None:
         Camera(np.full((3, 3), np.nan), np.eye(4), 4, 4)
     with pytest.raises(ArgumentError, match="size: expected"):
         Camera(np.eye(3), np.eye(4), 0, 4)
+
+
+def test_only_rotations_with_translations_are_rigid() -> None:
+    sound = orbit_camera(yaw_deg=40, pitch_deg=-20, **ORBIT).viewmat
+    assert is_rigid(sound) and is_rigid(sound.astype(np.float32))
+    mirror, scaled, far, row = np.diag([-1.0, 1, 1, 1]), 1.01 * sound, sound.copy(), sound.copy()
+    scaled[3], far[0, 3], row[3, 0] = [0, 0, 0, 1], 1e5, 0.1
+    for bad in (mirror, scaled, far, row, 0 * sound, np.full((4, 4), np.nan), np.full((4, 4), 1e300)):
+        assert not is_rigid(bad)

@@ -117,6 +117,8 @@ def test_neck_and_jaw_may_be_missing(saved):
         ("neck_rot", dict(neck_rot=np.zeros((T, 4)))),
         ("shape", dict(shape=np.array(["a", "b"]))),
         ("extr", dict(extr=np.eye(4)[None, :3])),
+        (r"extr\[0\]", dict(extr=np.zeros((1, 4, 4)))),
+        (r"extr\[0\]", dict(extr=np.diag([-1.0, 1, 1, 1])[None])),
         ("fx", dict(fx=np.array([[-1.0]]), fy=np.array([[1.0]]))),
         ("resolutions", dict(resolutions=np.array([[0, 8]]))),
         ("resolutions", dict(resolutions=np.array([[10**9, 8]]))),
