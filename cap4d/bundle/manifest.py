@@ -17,6 +17,7 @@ from cap4d.bundle.schema import (
     FORMAT,
     MANIFEST,
     MAX_ENTRY_BYTES,
+    MAX_GRID_VALUES,
     ONNX,
     PRECISIONS,
     REQUIRED_ENTRIES,
@@ -139,6 +140,9 @@ def _check_points(where: str, manifest: Manifest) -> None:
     points, wanted = manifest.counts["rig_points"], manifest.counts[kind]
     if points != wanted:
         raise DataError(where, "counts.rig_points", expected=f"{wanted}, the number of {kind}", found=points)
+    if manifest.rig_points == "mesh" and points >= manifest.counts["grid_vertices"]:
+        expected = f"fewer than the grid's {manifest.counts['grid_vertices']}, or points on the grid"
+        raise DataError(where, "counts.rig_points", expected=expected, found=points)
 
 
 def _counts(fields: _Fields) -> dict[str, int]:
@@ -152,7 +156,17 @@ def _counts(fields: _Fields) -> dict[str, int]:
         raise DataError(
             fields.where, "counts.grid_vertices", expected=expected, found=counts["grid_vertices"]
         )
+    _check_grid_values(fields.where, counts)
     return counts
+
+
+def _check_grid_values(where: str, counts: dict[str, int]) -> None:
+    """A reader mixes the rig's tensors from few points onto many: the result is bounded, as the file is."""
+    for name, per_vertex in (("expressions", 3), ("joints", 27)):
+        values = per_vertex * counts[name] * counts["grid_vertices"]
+        if values > MAX_GRID_VALUES:
+            expected = f"{per_vertex} x {name} x grid_vertices of at most {MAX_GRID_VALUES}"
+            raise DataError(where, f"counts.{name}", expected=expected, found=values)
 
 
 def _expressions(rig: _Fields, count: int) -> tuple[tuple[str, ...], np.ndarray]:

@@ -38,6 +38,8 @@ COUNTS = {
     "idle_frames": (1, 100_000),
 }
 """Inclusive limits of every count in the manifest."""
+MAX_GRID_VALUES = MAX_ENTRY_BYTES[RIG] // 4
+"""Of a basis on the grid's vertices, [E, G, 3] or [9J, G, 3]: no more than its entry holds in float32."""
 
 SYMBOLS = {
     "S": "grid_size",

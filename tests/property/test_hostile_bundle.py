@@ -190,6 +190,21 @@ def raw(change: Callable[[str], str]) -> Callable[[Forge], None]:
     return write
 
 
+def on_mesh_of(points: int) -> Callable[[Forge], None]:
+    """Says that the rig stands on as many points as its mesh has."""
+
+    def change(forge: Forge) -> None:
+        forge.manifest["rig"]["points"] = "mesh"
+        forge.manifest["counts"] |= {"rig_points": points, "rig_vertices": points}
+
+    return change
+
+
+def vast_grid(**counts: int) -> Callable[[Forge], None]:
+    """Few points of the rig, to be mixed onto a million of the grid."""
+    return lambda forge: forge.manifest["counts"].update(grid_size=1024, grid_vertices=1 << 20, **counts)
+
+
 MANIFESTS = {
     "not_json": (raw(lambda t: t[:-1]), "JSON"),
     "not_text": (lambda f: setattr(f, "raw_manifest", b"\xff\xfe{}"), "JSON"),
@@ -214,6 +229,9 @@ MANIFESTS = {
     "precision": (put("float8", "precision"), "precision"),
     "points": (put("cloud", "rig", "points"), "rig.points"),
     "points_count": (put("mesh", "rig", "points"), "counts.rig_points"),
+    "points_not_fewer_than_the_grid": (on_mesh_of(64), "counts.rig_points"),
+    "mixing_bomb": (vast_grid(expressions=128), "counts.expressions"),
+    "posing_bomb": (vast_grid(expressions=1, joints=64), "counts.joints"),
     "empty_name": (put("", "rig", "name"), "rig.name"),
     "long_name": (put("x" * 65, "rig", "licence"), "rig.licence"),
     "escape_in_a_name": (put("\x1b[31m", "rig", "name"), "rig.name"),

@@ -204,6 +204,17 @@ def test_the_released_sizes_fit() -> None:
     assert half <= 0.52 * single
 
 
+@pytest.mark.parametrize(
+    ("expressions", "joints", "grid_vertices"), [(65, 5, 14_425), (53, 3, 13_858), (52, 3, 15_132)]
+)
+def test_the_rigs_we_know_fit_on_a_grid_of_16_times_the_pixels(
+    expressions: int, joints: int, grid_vertices: int
+) -> None:
+    """FLAME, ICT-FaceKit and the built-in head, as sampled at 128 pixels a side."""
+    assert 3 * expressions * 16 * grid_vertices <= schema.MAX_GRID_VALUES
+    assert 27 * joints * 16 * grid_vertices <= schema.MAX_GRID_VALUES
+
+
 def test_a_failed_write_leaves_everything_as_it_was(bundle: Bundle, tmp_path: Path) -> None:
     path = tmp_path / "a.cap4d"
     write_bundle(bundle, path)
