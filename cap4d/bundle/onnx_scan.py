@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,7 @@ _OPERATOR_NAMES = """
 """
 OPERATORS = frozenset(_OPERATOR_NAMES.split())
 
-VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+VARINT, BYTES, FIXED32 = 0, 2, 5  # 1 is 8 bytes; nothing here is of it
 
 
 class _Malformed(Exception):
@@ -116,34 +117,47 @@ def _scan_node(data: memoryview) -> int:
 
 def _scan_attribute(data: memoryview) -> int:
     # Left out: 6 and 11, graphs; 14 and 15, types; 21, a function's argument; 22 and 23, sparse tensors.
-    attribute = _message(data, "AttributeProto", {1, 2, 3, 4, 5, 7, 8, 9, 10, 13, 20})
+    attribute = _message(data, "AttributeProto", {1, 2, 3, 4, 5, 7, 8, 9, 10, 13, 20}, fixed32={2, 7})
+    _require(len(attribute[5]) <= 1, "attribute.t", "one tensor", "several, which a parser would merge")
+    for value in attribute[2] + attribute[7]:
+        _scan_floats(_bytes(value, "attribute.floats"), FLOAT, "attribute.floats")
     return sum(_scan_tensor(_bytes(t, "attribute.t")) for t in attribute[5] + attribute[10])
 
 
 def _scan_tensor(data: memoryview) -> int:
-    # Left out: 3, a segment; 6, strings; 13, external data. 14 is the place of the data and must say "here".
-    tensor = _message(data, "TensorProto", {1, 2, 4, 5, 7, 8, 9, 10, 11, 12, 14, 16})
+    # Left out: 3, a segment; 4 to 7, 10 and 11, typed lists of values and strings; 13, external data. 14 is
+    # the place of the data and must say "here".
+    tensor = _message(data, "TensorProto", {1, 2, 8, 9, 12, 14, 16})
     _require(tensor[14] in ([], [0]), "tensor.data_location", "0 (inside the file)", tensor[14])
     kind = tensor[2][-1] if tensor[2] else None
     _require(kind in ITEM_BYTES, "tensor.data_type", f"one of {sorted(ITEM_BYTES)}", kind)
     dims = _integers(tensor[1], "tensor.dims")
     good = len(dims) <= MAX_DIMS and all(0 <= d < 1 << 31 for d in dims)
     _require(good, "tensor.dims", f"at most {MAX_DIMS} sizes", dims[: MAX_DIMS + 1])
-    if not tensor[9]:  # small tensors may hold typed lists; those cannot outgrow the file either
-        return 0
-    raw = _bytes(tensor[9][-1], "tensor.raw_data")
+    _require(len(tensor[9]) <= 1, "tensor.raw_data", "one of it", len(tensor[9]))
+    raw = _bytes(tensor[9][0], "tensor.raw_data") if tensor[9] else memoryview(b"")
     wanted = math.prod(dims) * ITEM_BYTES[kind]
-    _require(len(tensor[9]) == 1 and len(raw) == wanted, "tensor.raw_data", f"{wanted} bytes", len(raw))
+    _require(len(raw) == wanted, "tensor.raw_data", f"{wanted} bytes", len(raw))
     if kind in (FLOAT, FLOAT16):
-        values = np.frombuffer(raw, "<f4" if kind == FLOAT else "<f2")
-        _require(
-            bool(np.isfinite(values).all()), "tensor.raw_data", "finite weights", "a value that is not finite"
-        )
+        _scan_floats(raw, kind, "tensor.raw_data")
     return len(raw)
 
 
-def _message(data: memoryview, name: str, known: set[int]) -> defaultdict[int, list]:
-    """The fields of one message: number -> values in order, each an int or a memoryview."""
+def _scan_floats(raw: memoryview, kind: int, field: str) -> None:
+    item = ITEM_BYTES[kind]
+    _require(len(raw) % item == 0, field, f"numbers of {item} bytes", f"{len(raw)} bytes")
+    values = np.frombuffer(raw, f"<f{item}")
+    _require(bool(np.isfinite(values).all()), field, "finite numbers", "a value that is not finite")
+
+
+def _message(
+    data: memoryview, name: str, known: set[int], *, fixed32: Collection[int] = ()
+) -> defaultdict[int, list]:
+    """The fields of one message: number -> values in order, each an int or a memoryview.
+
+    Only fields in `fixed32` may come in 4 bytes and none in 8: a parser passes over a field of another wire
+    type than its own, so what was checked here would not be what it sees.
+    """
     fields: defaultdict[int, list] = defaultdict(list)
     at = count = 0
     while at < len(data):
@@ -157,11 +171,10 @@ def _message(data: memoryview, name: str, known: set[int]) -> defaultdict[int, l
         elif wire == BYTES:
             length, at = _varint(data, at)
             value, at = data[at : at + length], at + length
-        elif wire in (FIXED32, FIXED64):
-            length = 4 if wire == FIXED32 else 8
-            value, at = data[at : at + length], at + length
+        elif wire == FIXED32 and number in fixed32:
+            value, at = data[at : at + 4], at + 4
         else:
-            raise _Malformed(name, "wire type 0, 1, 2 or 5", wire)
+            raise _Malformed(name, f"another wire type for field {number}", wire)
         _require(at <= len(data), name, "a whole message", "one cut short")
         fields[number].append(value)
     return fields

@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
+import onnx
 from cap4d.bundle import Bundle, read_bundle, write_bundle
 from cap4d.bundle.container import CENTRAL_MAGIC, LOCAL_MAGIC
 from cap4d.bundle.onnx_scan import scan_onnx
@@ -449,6 +450,17 @@ def nan_weight(model) -> None:
     tensor.raw_data = np.full(len(tensor.raw_data) // 4, np.nan, np.float32).tobytes()
 
 
+def nan_list(model) -> None:
+    """A weight as a typed list instead of bytes, which is as good to a runtime."""
+    tensor = model.graph.initializer[1]
+    tensor.ClearField("raw_data")
+    tensor.float_data.extend([float("nan")] * int(np.prod(tensor.dims)))
+
+
+def constant(**attribute) -> Callable:
+    return lambda model: model.graph.node.insert(0, onnx.helper.make_node("Constant", [], ["c"], **attribute))
+
+
 def lying_dims(model) -> None:
     model.graph.initializer[1].dims[0] = 1 << 30
 
@@ -479,6 +491,10 @@ NETWORKS = {
     ),
     "weights_short": (lambda m: setattr(m.graph.initializer[1], "raw_data", b"\0" * 8), "tensor.raw_data"),
     "weights_nan": (nan_weight, "tensor.raw_data"),
+    "weights_nan_in_a_list": (nan_list, "TensorProto"),
+    "weights_missing": (lambda m: m.graph.initializer[1].ClearField("raw_data"), "tensor.raw_data"),
+    "constant_nan": (constant(value_float=float("nan")), "attribute.floats"),
+    "constant_infinite": (constant(value_floats=[0.0, float("inf")]), "attribute.floats"),
     "dims_lie": (lying_dims, "tensor.raw_data"),
     "dims_negative": (lambda m: m.graph.initializer[1].dims.insert(0, -1), "tensor.dims"),
     "string_tensor": (lambda m: setattr(m.graph.initializer[1], "data_type", 8), "tensor.data_type"),
@@ -497,6 +513,39 @@ def test_network(name: str, sound: Path, tmp_path: Path) -> None:
     forge.write(path)
     error = refusal(path)
     assert error.field == field and error.source == f"{path}:{ONNX}"
+
+
+def field(number: int, payload: bytes, *, wire: int = 2) -> bytes:
+    """A field of protobuf's wire format; wire type 2 is preceded by its length."""
+    length, left = b"", len(payload)
+    while wire == 2 and (left or not length):
+        length, left = length + bytes([left & 0x7F | (0x80 if left > 0x7F else 0)]), left >> 7
+    return bytes([number << 3 | wire]) + length + payload
+
+
+def with_constant(network: bytes, attribute: bytes) -> bytes:
+    """The network with one more node, a Constant, whose attribute is these bytes."""
+    model = onnx.load_from_string(network)
+    node = field(2, b"c") + field(4, b"Constant") + field(5, field(1, b"value") + attribute)
+    graph = model.graph.SerializeToString() + field(1, node)
+    model.ClearField("graph")
+    return model.SerializeToString() + field(7, graph)
+
+
+def test_what_a_parser_would_read_differently_is_refused(sound: Path) -> None:
+    network = Forge(sound).entries[ONNX]
+    tensor = onnx.numpy_helper.from_array(np.zeros(2, np.float32)).SerializeToString()
+    scan_onnx(with_constant(network, field(5, tensor)), source="x", size=SIZE)
+
+    merged = onnx.AttributeProto.FromString(2 * field(5, tensor)).t
+    assert (list(merged.dims), len(merged.raw_data)) == ([2, 2], 8), "sizes and bytes disagree"
+    with pytest.raises(DataError, match=r"attribute\.t: expected one tensor"):
+        scan_onnx(with_constant(network, 2 * field(5, tensor)), source="x", size=SIZE)
+
+    of_8_bytes = field(1, b"\x02", wire=0) + field(2, b"\x01", wire=0) + field(9, bytes(8), wire=1)
+    assert not onnx.TensorProto.FromString(of_8_bytes).raw_data, "passed over, as of another wire type"
+    with pytest.raises(DataError, match="TensorProto: expected another wire type for field 9"):
+        scan_onnx(with_constant(network, field(5, of_8_bytes)), source="x", size=SIZE)
 
 
 def test_a_network_that_passes_the_scan_but_is_not_sound_is_refused_when_loaded(sound: Path) -> None:
