@@ -6,11 +6,7 @@ Reading and writing only: tracking is in track/, fitting in avatar/.
 
 from __future__ import annotations
 
-import io
 import json
-import os
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +14,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cap4d.atomic import replacing
 from cap4d.camera import Camera, head_fixed, is_rigid
 from cap4d.capture.image import IMAGE_SUFFIXES, composite, read_image
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError, DataError
 from cap4d.rig.flame import RELEASED_RIG
+from cap4d.rig.npz import checked, checked_float32, read_npz
 
 POSE_FIELDS = ("rot", "tra", "eye_rot", "neck_rot", "jaw_rot")
 OPTIONAL_POSE_FIELDS = ("neck_rot", "jaw_rot")
+CAMERA_FIELDS = ("camera_order", "fx", "fy", "cx", "cy", "extr", "resolutions")
+FIELDS = frozenset(
+    {"shape", "expr", "fps", "rig_name", "valid_mask", "held_out", "error", *POSE_FIELDS, *CAMERA_FIELDS}
+)
+"""What is read of a fit.npz; a tracker may leave more in it."""
 MAX_FRAMES = 1_000_000
 
 
@@ -155,7 +158,7 @@ def save_capture(
         valid: bool[C, T] which frames were tracked; None: all.
         references: (camera, frame) of the images an avatar is made from; None: all valid frames.
     Raises:
-        ArgumentError: An array has the wrong shape or is not finite.
+        ArgumentError: An array has the wrong shape or is not finite; or a file cannot be written.
     """
     path, frames = Path(path), len(expr)
     zeros = np.zeros((frames, 3))
@@ -173,12 +176,12 @@ def save_capture(
     if error is not None:
         arrays["error"] = np.float64(error)
     path.mkdir(parents=True, exist_ok=True)
-    packed = io.BytesIO()
-    np.savez_compressed(packed, **arrays)
-    _replace(path / "fit.npz", packed.getvalue())
+    with replacing(path / "fit.npz") as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(stream, **arrays)
     if references is not None:
         listing = json.dumps([[camera, int(frame)] for camera, frame in references], indent=1)
-        _replace(path / "reference_images.json", listing.encode())
+        with replacing(path / "reference_images.json") as temporary:
+            temporary.write_text(listing, encoding="utf-8")
 
 
 def _camera_arrays(cameras: Mapping[str, Camera]) -> dict[str, np.ndarray]:
@@ -203,65 +206,23 @@ def _float32(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray
     return value.astype(np.float32)
 
 
-def _replace(path: Path, data: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-_BROKEN_ARCHIVE = (
-    *(OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError),
-    *(MemoryError, OverflowError, zipfile.BadZipFile, zlib.error),
-)  # what NumPy and zipfile raise on files that are cut, corrupt, encrypted, or hold something else
-
-
 class _Fit:
     """fit.npz, checked field by field."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                self.arrays = {name: archive[name] for name in archive.files}
-        except FileNotFoundError as error:
-            raise DataError(path, "file", expected="a capture's fit.npz", found="no such file") from error
-        except _BROKEN_ARCHIVE as error:
-            raise DataError(path, "archive", expected="an .npz of plain arrays", found=error) from error
+        self.arrays = read_npz(path, names=FIELDS)
 
     def numbers(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
-        """Finite numbers whose shape matches (None: any length), as float32."""
-        value = self._get(name)
-        wanted = f"finite float32[{', '.join('N' if n is None else str(n) for n in shape)}]"
-        fits = value.ndim == len(shape) and all(
-            n in (None, m) for n, m in zip(shape, value.shape, strict=True)
-        )
-        if value.dtype.kind not in "fiu" or not fits:
-            raise DataError(self.path, name, expected=wanted, found=f"{value.dtype}{list(value.shape)}")
-        value = value.astype(np.float32)
-        if not np.isfinite(value).all():
-            raise DataError(self.path, name, expected=wanted, found="a value that is not finite")
-        return value
+        return checked_float32(self.path, name, self.arrays.get(name), shape=shape)
 
     def flags(self, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
         if name not in self.arrays:
             return None
-        value = self.arrays[name]
-        if value.dtype != bool or value.shape != shape:
-            raise DataError(
-                self.path, name, expected=f"bool{list(shape)}", found=f"{value.dtype}{list(value.shape)}"
-            )
-        return value
+        return checked(self.path, name, self.arrays[name], kind="bool", shape=shape)
 
-    def text(self, name: str) -> str | None:
-        if name not in self.arrays:
-            return None
-        value = self.arrays[name]
-        if value.dtype.kind != "U" or value.ndim != 0:
-            raise DataError(self.path, name, expected="a string", found=f"{value.dtype}{list(value.shape)}")
-        return str(value)
+    def texts(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+        return checked(self.path, name, self.arrays.get(name), kind="text", shape=shape)
 
     def number(self, name: str, *, positive: bool = False) -> float | None:
         if name not in self.arrays:
@@ -270,11 +231,6 @@ class _Fit:
         if positive and value <= 0:
             raise DataError(self.path, name, expected="a positive number", found=value)
         return value
-
-    def _get(self, name: str) -> np.ndarray:
-        if name not in self.arrays:
-            raise DataError(self.path, name, expected="an array", found="nothing")
-        return self.arrays[name]
 
 
 def _build(path: Path, fit: _Fit) -> Capture:
@@ -289,7 +245,7 @@ def _build(path: Path, fit: _Fit) -> Capture:
     cameras = _cameras(fit)
     return Capture(
         path=path,
-        rig_name=fit.text("rig_name"),
+        rig_name=str(fit.texts("rig_name", ())) if "rig_name" in fit.arrays else None,
         shape=fit.numbers("shape", (None,)),
         expr=expr,
         cameras=cameras,
@@ -302,11 +258,9 @@ def _build(path: Path, fit: _Fit) -> Capture:
 
 
 def _cameras(fit: _Fit) -> dict[str, Camera]:
-    names = fit._get("camera_order")
-    if names.dtype.kind != "U" or names.ndim != 1 or not len(names):
-        raise DataError(
-            fit.path, "camera_order", expected="str[C]", found=f"{names.dtype}{list(names.shape)}"
-        )
+    names = fit.texts("camera_order", (None,))
+    if not len(names):
+        raise DataError(fit.path, "camera_order", expected="at least one camera", found="none")
     n = len(names)
     fx, fy, cx, cy = (fit.numbers(name, (n, 1))[:, 0] for name in ("fx", "fy", "cx", "cy"))
     extr, sizes = fit.numbers("extr", (n, 4, 4)), fit.numbers("resolutions", (n, 2))

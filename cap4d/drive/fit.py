@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +10,10 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.drive.clip import Clip
 from cap4d.errors import DataError
 from cap4d.rig.flame import RELEASED_RIG
-from cap4d.rig.npz import checked, read_npz
+from cap4d.rig.npz import checked, checked_float32, read_npz
 
-MAX_BYTES = 1 << 29  # unpacked
 MAX_FRAMES = 200_000
+FIELDS = frozenset({"expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra", "rig_name", "fps"})
 DEFAULT_FPS = 24.0  # of a sequence that names none (fact 46)
 
 
@@ -28,9 +26,9 @@ def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
     Raises:
         DataError: Not sound, or of another rig.
     """
-    arrays = read_arrays(path)
+    arrays = read_npz(path, names=FIELDS)
     _check_rig(path, arrays, bundle)
-    expr = checked(path, "expr", arrays.get("expr"), kind="float", shape=(None, bundle.n_expressions))
+    expr = checked_float32(path, "expr", arrays.get("expr"), shape=(None, bundle.n_expressions))
     frames = len(expr)
     if not 1 <= frames <= MAX_FRAMES:
         raise DataError(path, "expr", expected=f"1 to {MAX_FRAMES} frames", found=frames)
@@ -38,30 +36,8 @@ def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
     turns = {name: zeros for name in ("neck_rot", "jaw_rot") if name not in arrays}
     pose = {name: None for name in ("rot", "tra") if not {"rot", "tra"} <= arrays.keys()}
     for name in {"eye_rot", "neck_rot", "jaw_rot", "rot", "tra"} - turns.keys() - pose.keys():
-        value = checked(path, name, arrays.get(name), kind="float", shape=(frames, 3))
-        turns[name] = value.astype(np.float32)
-    return Clip(bundle.rig_name, fps or _fps(path, arrays), expr.astype(np.float32), **turns, **pose)
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz of bounded size; see `rig.npz.read_npz`."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-        if size > MAX_BYTES:
-            raise DataError(path, "size", expected=f"at most {MAX_BYTES} bytes unpacked", found=size)
-        return read_npz(path)
-    except FileNotFoundError as error:
-        raise DataError(path, "file", expected="an .npz archive", found="no such file") from error
-    except BROKEN_ARCHIVE as error:
-        raise DataError(path, "archive", expected="an .npz of plain arrays", found=error) from error
-
-
-BROKEN_ARCHIVE = (
-    *(OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError),
-    *(MemoryError, OverflowError, SyntaxError, zipfile.BadZipFile, zlib.error),
-)
-"""What NumPy and zipfile raise on files that are cut, corrupt, encrypted, or hold something else."""
+        turns[name] = checked_float32(path, name, arrays.get(name), shape=(frames, 3))
+    return Clip(bundle.rig_name, fps or _fps(path, arrays), expr, **turns, **pose)
 
 
 def _check_rig(path: Path, arrays: dict[str, np.ndarray], bundle: Bundle) -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from cap4d.bundle.bundle import Bundle
-from cap4d.drive.fit import BROKEN_ARCHIVE, MAX_FRAMES, read_arrays
+from cap4d.drive.fit import MAX_FRAMES
 from cap4d.errors import ArgumentError, DataError
-from cap4d.rig.npz import checked, read_npy
+from cap4d.rig.npz import checked, read_npy, read_npz
 
 VERTEX_FPS = 30.0  # CodeTalker on VOCASET; the files name no rate
 FLAME_VERTICES = 5023
@@ -28,7 +28,7 @@ def read_vertices(path: Path, count: int) -> np.ndarray:
     Raises:
         DataError: Not sound, or of another topology.
     """
-    value = _numbers(path, "vertices", _read_npy(path))
+    value = _numbers(path, "vertices", read_npy(path))
     per_frame = value.shape[1] if value.ndim == 2 else value.shape[1] * 3 if value.ndim == 3 else 0
     if per_frame != 3 * count or (value.ndim == 3 and value.shape[2] != 3):
         other = " (BIWI's mesh, which is not FLAME's)" if per_frame == 3 * BIWI_VERTICES else ""
@@ -46,7 +46,7 @@ def read_template(path: Path, count: int) -> np.ndarray:
         ArgumentError: Another kind of file.
         DataError: Not sound, or of another topology.
     """
-    readers = {".npy": _read_npy, ".npz": lambda p: read_arrays(p).get("template"), ".obj": _read_obj}
+    readers = {".npy": read_npy, ".npz": _read_template_npz, ".obj": _read_obj}
     if path.suffix not in readers:
         raise ArgumentError(f"template: expected one of {', '.join(readers)}, got {path}")
     value = readers[path.suffix](path)
@@ -59,17 +59,15 @@ def read_template(path: Path, count: int) -> np.ndarray:
 def _numbers(path: Path, name: str, value: np.ndarray) -> np.ndarray:
     if value.dtype.kind != "f":
         raise DataError(path, name, expected="floating-point numbers, m", found=value.dtype)
-    value = np.ascontiguousarray(value, np.float32)
+    with np.errstate(over="ignore"):
+        value = np.ascontiguousarray(value, np.float32)
     if value.size and not np.isfinite([value.min(), value.max()]).all():
         raise DataError(path, name, expected="finite numbers", found="one that is not")
     return value
 
 
-def _read_npy(path: Path) -> np.ndarray:
-    try:
-        return read_npy(path)
-    except BROKEN_ARCHIVE as error:
-        raise DataError(path, "array", expected="an .npy of plain numbers", found=error) from error
+def _read_template_npz(path: Path) -> np.ndarray | None:
+    return read_npz(path, names={"template"}).get("template")
 
 
 def _read_obj(path: Path) -> np.ndarray:

@@ -10,12 +10,12 @@ import numpy as np
 
 from cap4d.camera import Camera, head_fixed, is_rigid, look_at
 from cap4d.drive.clip import Frame
-from cap4d.drive.fit import read_arrays
 from cap4d.errors import ArgumentError, DataError
-from cap4d.rig.npz import checked
+from cap4d.rig.npz import checked, read_npz
 
 ORBIT_YAW, ORBIT_PITCH, ORBIT_SECONDS = 55.0, 20.0, 8.0  # degrees and s (fact 51)
 MAX_SIDE = 16384  # px
+CAMERA_FIELDS = frozenset({"extr", "fx", "fy", "cx", "cy", "resolution", "resolutions"})
 
 CameraPath = Callable[[int, Frame], Camera]
 """(number of the frame, the driven frame) -> camera in the head-fixed world."""
@@ -98,7 +98,7 @@ def fitted(camera: Camera, size: tuple[int, int] | None) -> Camera:
 
 
 def _read_cameras(path: Path) -> list[Camera]:
-    arrays = read_arrays(path)
+    arrays = read_npz(path, names=CAMERA_FIELDS)
     is_fit = "resolution" not in arrays
     extr = checked(path, "extr", arrays.get("extr"), kind="float", shape=(None, 4, 4)).astype(np.float64)
     if not len(extr):

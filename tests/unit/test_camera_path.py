@@ -34,3 +34,7 @@ def test_what_is_no_camera_is_refused(changes: dict, field: str, tmp_path: Path)
     assert file_path(cameras(tmp_path / "sound.npz"), None)
     with pytest.raises(DataError, match=f": {field}: expected"):
         file_path(cameras(tmp_path / "c.npz", **changes), None)
+
+
+def test_other_arrays_are_not_read(tmp_path: Path) -> None:
+    assert file_path(cameras(tmp_path / "c.npz", notes=np.array([{}], object)), None)

@@ -1,6 +1,7 @@
 """A capture comes back as it was saved, released folders load as they stand, malformed ones are named."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -117,8 +118,6 @@ def test_neck_and_jaw_may_be_missing(saved):
         ("neck_rot", dict(neck_rot=np.zeros((T, 4)))),
         ("shape", dict(shape=np.array(["a", "b"]))),
         ("extr", dict(extr=np.eye(4)[None, :3])),
-        (r"extr\[0\]", dict(extr=np.zeros((1, 4, 4)))),
-        (r"extr\[0\]", dict(extr=np.diag([-1.0, 1, 1, 1])[None])),
         ("fx", dict(fx=np.array([[-1.0]]), fy=np.array([[1.0]]))),
         ("resolutions", dict(resolutions=np.array([[0, 8]]))),
         ("resolutions", dict(resolutions=np.array([[10**9, 8]]))),
@@ -130,7 +129,11 @@ def test_neck_and_jaw_may_be_missing(saved):
         ("held_out", dict(held_out=np.zeros(T))),
         ("fps", dict(fps=np.float64(0))),
         ("rig_name", dict(rig_name=np.array(3))),
-        ("archive", dict(shape=np.array([{}], object))),
+        ("shape", dict(shape=np.array([{}], object))),
+        ("expr", dict(expr=np.full((T, E), 1e300))),
+        (r"extr\[0\]", dict(extr=np.zeros((1, 4, 4)))),
+        (r"extr\[0\]", dict(extr=np.diag([-1.0, 1, 1, 1])[None])),
+        ("fx", dict(fx=np.array([[0.0]]))),
     ],
 )
 def test_malformed_fit_is_named(saved, field, changes):
@@ -138,6 +141,23 @@ def test_malformed_fit_is_named(saved, field, changes):
     with pytest.raises(DataError, match=rf"fit\.npz: .*{field}") as caught:
         Capture.load(saved)
     assert "\n" not in str(caught.value)
+
+
+def test_what_nobody_asked_for_is_not_unpacked(saved):
+    _rewrite(saved, notes=np.array([{}], object))
+    assert len(Capture.load(saved)) == T
+
+
+def test_a_bomb_is_refused_before_it_is_unpacked(saved):
+    _rewrite(saved, held_out=None)
+    with zipfile.ZipFile(saved / "fit.npz", "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("held_out.npy", bytes(1000))
+    data = bytearray((saved / "fit.npz").read_bytes())
+    at = data.rindex(b"PK\x01\x02")
+    data[at + 24 : at + 28] = ((1 << 29) + 1).to_bytes(4, "little")
+    (saved / "fit.npz").write_bytes(data)
+    with pytest.raises(DataError, match="size: expected at most"):
+        Capture.load(saved)
 
 
 @pytest.mark.parametrize(
