@@ -58,13 +58,15 @@ def track(source: str | Path, rig: HeadRig, output: str | Path, *, overlay: bool
     Args:
         source: A video, an image, or a folder of photos of one person.
         rig: Any head rig.
-        output: The capture to write; may be an empty folder, else must not exist.
+        output: The capture to write, in a folder that exists; may be an empty folder, else must not exist.
         overlay: Also write overlay.mp4 (video) or overlay.png (photos).
     Raises:
-        ArgumentError: `output` is taken, or `source` does not exist.
+        ArgumentError: `output` is taken or its parent does not exist, or `source` does not exist. Nothing was
+            looked at or written.
         DataError: `source` cannot be read, or no frame shows a face.
     """
     start = time.monotonic()
+    check_new_folder(Path(output))
     footage = open_footage(source)
     with _new_folder(Path(output)) as folder:
         observations = _look(footage, folder)
@@ -100,16 +102,18 @@ def track(source: str | Path, rig: HeadRig, output: str | Path, *, overlay: bool
     return report
 
 
+def check_new_folder(output: Path) -> None:
+    """Raises ArgumentError unless a capture can go there: the parent exists; it is empty or not there."""
+    if output.exists() and not (output.is_dir() and not any(output.iterdir())):
+        raise ArgumentError(f"output: {output} exists already; choose another folder or remove it")
+    if not output.parent.is_dir():
+        raise ArgumentError(f"output: the folder of {output} does not exist")
+
+
 @contextmanager
 def _new_folder(output: Path) -> Iterator[Path]:
     """A temporary folder beside `output` that takes its place when all went well, and is gone otherwise."""
-    if output.exists() and not (output.is_dir() and not any(output.iterdir())):
-        raise ArgumentError(f"{output}: exists already; choose another folder or remove it")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
-    except OSError as error:
-        raise ArgumentError(f"{output}: cannot be made: {error.strerror}") from error
+    folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
     try:
         yield folder
         folder.chmod(0o755)

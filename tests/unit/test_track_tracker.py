@@ -76,6 +76,26 @@ def test_a_taken_output_is_refused_before_any_work(tmp_path, builtin_rig):
     assert (tmp_path / "capture" / "mine.txt").read_text() == "precious"
 
 
+@pytest.mark.parametrize(
+    ("source", "output", "words"),
+    [
+        ("no.mp4", "capture", "no such video"),
+        ("a.png", "nowhere/capture", "the folder of nowhere/capture does not exist"),
+        ("a.png", "a.png", "exists already"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_any_work(source, output, words, tmp_path, monkeypatch):
+    def look(*_):
+        raise AssertionError("began to work")
+
+    write_image(tmp_path / "a.png", np.zeros((8, 8, 3)))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cap4d.track.tracker._look", look)
+    with pytest.raises(ArgumentError, match=words):
+        track(source, None, output)
+    assert [f.name for f in tmp_path.iterdir()] == ["a.png"]
+
+
 def test_pictures_without_a_face_leave_nothing(tmp_path, builtin_rig):
     write_image(tmp_path / "a.png", np.full((96, 128, 3), 0.3))
     with pytest.raises(DataError, match="a face") as caught:
