@@ -1,6 +1,7 @@
 """The `cap4d` command line: one function per command, imports inside. The device is chosen here.
 
-Exit codes: 0 success, 1 bad data (one line: file, field, expected, found), 2 a bad argument, 130 interrupted.
+Exit codes: 0 success, 1 bad data (one line: file, field, expected, found) or what the system refused, 2 a bad
+argument or a missing package, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ EXAMPLES = """examples:
   cap4d fit capture --rig ict.npz --preset low -o me.cap4d
   cap4d-view me.cap4d
 """
+HELD_OUT = """held-out frames (every 10th and the last tenth of a video, or those the capture marks) are never
+trained on; their expressions and poses come from the tracker, which sees all frames."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,17 +49,46 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def command(commands, name: str, run: Callable, help: str, example: str) -> argparse.ArgumentParser:
-    """A subparser with the house's layout: what it does, its options, an example."""
+def command(
+    commands, name: str, run: Callable | None, help: str, example: str, *, more: str = ""
+) -> argparse.ArgumentParser:
+    """A subparser with the house's layout: what it does, its options, an example.
+
+    Args:
+        run: None for a group of commands.
+        more: Lines below what it does.
+    """
     parser = commands.add_parser(
         name,
         help=help,
-        description=help[0].upper() + help[1:] + ".",
+        description=help[0].upper() + help[1:] + "." + ("\n\n" + more if more else ""),
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(run=run)
+    if run is not None:
+        parser.set_defaults(run=run)
     return parser
+
+
+def add_rig_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--rig", type=Path, required=True, metavar="RIG.npz", help="head model, made by `cap4d rig import`"
+    )
+
+
+def add_avatar(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("avatar", type=Path, metavar="AVATAR.cap4d", help="made by `cap4d fit`")
+
+
+def add_output(parser: argparse.ArgumentParser, metavar: str, help: str, *, required: bool = True) -> None:
+    parser.add_argument("-o", "--output", type=Path, required=required, metavar=metavar, help=help)
+
+
+def check_output(path: Path) -> None:
+    """Raises ArgumentError where no file `path` can be, before the work that ends with it."""
+    from cap4d.player.video import check_file
+
+    check_file(path, "output")
 
 
 # demo ---------------------------------------------------------------------------------------------
@@ -71,16 +103,26 @@ def add_demo(commands) -> None:
         "cap4d demo --video me.mp4 --rig ict.npz",
     )
     parser.add_argument(
-        "--video", type=Path, help="make the avatar from this video instead of the built-in head"
+        "--video",
+        type=Path,
+        metavar="VIDEO",
+        help="make the avatar from this video instead of the built-in head",
     )
     parser.add_argument(
-        "--rig", type=Path, help="head model for --video (a rig .npz; default: the built-in head)"
+        "--rig",
+        type=Path,
+        metavar="RIG.npz",
+        help="head model for --video, made by `cap4d rig import` (default: the built-in head)",
     )
     parser.add_argument(
         "--preset", default="low", choices=("debug", "low"), help="fit settings for --video (default: low)"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("out"), help="folder for what the demo writes (default: out)"
+        "--out",
+        type=Path,
+        default=Path("out"),
+        metavar="FOLDER",
+        help="for what the demo writes; made when missing (default: out)",
     )
 
 
@@ -99,11 +141,24 @@ def run_demo(arguments: argparse.Namespace) -> int:
 
 
 def add_rig(commands) -> None:
-    parser = commands.add_parser("rig", help="import or look at a head model")
-    verbs = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    kinds = verbs.add_parser("import", help="make a rig .npz of a head model").add_subparsers(
-        title="head models", required=True, metavar="MODEL"
+    parser = command(
+        commands,
+        "rig",
+        None,
+        "import a head model, or look at one",
+        "cap4d rig import ict FaceXModel -o ict.npz",
+        more="A rig is a head mesh with identities, expressions and joints; track and fit need one.",
     )
+    verbs = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    importer = command(
+        verbs,
+        "import",
+        None,
+        "make a rig .npz of a head model",
+        "cap4d rig import builtin -o builtin.npz",
+        more="Nothing in the model's files is executed. The rig keeps the licence of the model.",
+    )
+    kinds = importer.add_subparsers(title="head models", required=True, metavar="MODEL")
     flame = command(
         kinds,
         "flame",
@@ -111,10 +166,11 @@ def add_rig(commands) -> None:
         "a FLAME 2020 or 2023 pickle, read without executing anything in it",
         "cap4d rig import flame flame2023_no_jaw.pkl --assets cap4d/data/assets/flame -o flame.npz",
     )
-    flame.add_argument("model", type=Path, metavar="MODEL.pkl")
+    flame.add_argument("model", type=Path, metavar="MODEL.pkl", help="as downloaded from flame.is.tue.mpg.de")
     flame.add_argument(
         "--assets",
         type=Path,
+        metavar="FOLDER",
         help="folder of the CAP4D assets (template, blink, jaw regressor, vertex lists)",
     )
     flame.add_argument(
@@ -130,7 +186,7 @@ def add_rig(commands) -> None:
         "ICT-FaceKit Light: a FaceXModel folder, or one packed .npz",
         "cap4d rig import ict FaceXModel -o ict.npz",
     )
-    ict.add_argument("model", type=Path, metavar="FACEXMODEL")
+    ict.add_argument("model", type=Path, metavar="FACEXMODEL", help="the folder, or the packed .npz")
     builtin = command(
         kinds,
         "builtin",
@@ -139,7 +195,7 @@ def add_rig(commands) -> None:
         "cap4d rig import builtin -o builtin.npz",
     )
     for kind in (flame, ict, builtin):
-        kind.add_argument("-o", "--output", type=Path, required=True, metavar="RIG.npz")
+        add_output(kind, "RIG.npz", "rig to write; replaced if it exists")
     show = command(
         verbs,
         "show",
@@ -147,16 +203,17 @@ def add_rig(commands) -> None:
         "draw a rig and each of its expressions",
         "cap4d rig show ict.npz -o ict.png",
     )
-    show.add_argument("rig", type=Path, metavar="RIG.npz")
+    show.add_argument("rig", type=Path, metavar="RIG.npz", help="made by `cap4d rig import`")
     show.add_argument(
         "--on", type=Path, metavar="CAPTURE", help="draw it over the first photo of a capture instead"
     )
-    show.add_argument("-o", "--output", type=Path, help="PNG to write (default: beside the rig)")
+    add_output(show, "PICTURE.png", "picture to write (default: beside the rig)", required=False)
 
 
 def run_import_flame(arguments: argparse.Namespace) -> None:
     from cap4d.rig.flame import import_flame
 
+    check_output(arguments.output)
     rig = import_flame(arguments.model, arguments.assets, compat_pose_offset=arguments.compat_pose_offset)
     write_rig(rig, arguments.output)
 
@@ -164,12 +221,14 @@ def run_import_flame(arguments: argparse.Namespace) -> None:
 def run_import_ict(arguments: argparse.Namespace) -> None:
     from cap4d.rig.ict import import_ict
 
+    check_output(arguments.output)
     write_rig(import_ict(arguments.model), arguments.output)
 
 
 def run_import_builtin(arguments: argparse.Namespace) -> None:
     from cap4d.rig.builtin import build_head
 
+    check_output(arguments.output)
     write_rig(build_head(), arguments.output)
 
 
@@ -186,8 +245,9 @@ def write_rig(rig, output: Path) -> None:
 def run_show_rig(arguments: argparse.Namespace) -> None:
     from cap4d.rig.store import load_rig
 
-    rig = load_rig(arguments.rig)
     output = arguments.output or arguments.rig.with_suffix(".png")
+    check_output(output)
+    rig = load_rig(arguments.rig)
     if arguments.on is None:
         from cap4d.rig.show import contact_sheet
 
@@ -223,16 +283,22 @@ def add_track(commands) -> None:
     parser.add_argument(
         "input", type=Path, metavar="INPUT", help="a video, an image, or a folder of images of one person"
     )
-    parser.add_argument("--rig", type=Path, required=True, metavar="RIG.npz")
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="CAPTURE", help="folder to write; must not exist"
+    add_rig_option(parser)
+    add_output(
+        parser,
+        "CAPTURE",
+        "folder to write: its parent must exist; an existing folder that is not empty is refused",
     )
 
 
 def run_track(arguments: argparse.Namespace) -> None:
     from cap4d.rig.store import load_rig
     from cap4d.track import track
+    from cap4d.track.footage import open_footage
+    from cap4d.track.tracker import check_new_folder
 
+    check_new_folder(arguments.output)
+    open_footage(arguments.input)
     track(arguments.input, load_rig(arguments.rig), arguments.output)
 
 
@@ -243,24 +309,41 @@ def add_fit(commands) -> None:
         run_fit,
         "fit an avatar to one or more captures of a person",
         "cap4d fit capture --rig ict.npz --preset low -o me.cap4d",
+        more=HELD_OUT,
     )
-    parser.add_argument("captures", type=Path, nargs="+", metavar="CAPTURE")
-    parser.add_argument("--rig", type=Path, required=True, metavar="RIG.npz")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="AVATAR.cap4d")
     parser.add_argument(
-        "--preset", default="low", choices=("debug", "low"), help="debug: a minute; low: for CPUs, 256x256"
+        "captures",
+        type=Path,
+        nargs="+",
+        metavar="CAPTURE",
+        help="folders made by `cap4d track`; the first gives the identity and the idle clip",
+    )
+    add_rig_option(parser)
+    add_output(
+        parser,
+        "AVATAR.cap4d",
+        "avatar to write; beside it go numbers (.fit.json) and a picture (.fit.png)",
+    )
+    parser.add_argument(
+        "--preset",
+        default="low",
+        choices=("debug", "low"),
+        help="debug: a minute; low: for CPUs, 256x256 (default: low)",
     )
     parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted fit"
     )
     parser.add_argument("--ablate", choices=("unet",), help="leave a part out, to see what it is worth")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="same seed, same machine: same avatar (default: 0)"
+    )
 
 
 def run_fit(arguments: argparse.Namespace) -> None:
     from cap4d.avatar.fit import fit
     from cap4d.rig.store import load_rig
 
+    check_output(arguments.output)
     fit(
         arguments.captures,
         load_rig(arguments.rig),
@@ -283,17 +366,25 @@ def add_render(commands) -> None:
         "draw an avatar driven by a file, on the CPU",
         "cap4d render me.cap4d --drive fit.npz --camera orbit -o out.mp4",
     )
-    parser.add_argument("avatar", type=Path, metavar="AVATAR.cap4d")
+    add_avatar(parser)
     parser.add_argument(
         "--drive", metavar="SRC", help="fit.npz or vertices .npy (default: the avatar's idle clip)"
     )
-    parser.add_argument("--template", type=Path, help="neutral vertices of a .npy stream")
-    parser.add_argument("--fps", type=float, help="rate of a source that does not say its own")
-    parser.add_argument("--camera", default="static", metavar="static|orbit|FILE")
-    parser.add_argument("--size", default="512x512", metavar="WxH")
-    parser.add_argument("--frames", type=int, help="default: the whole clip, once")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.mp4|FRAME_%04d.png")
-    parser.add_argument("--stats", type=Path, help="write times per stage to this JSON file")
+    parser.add_argument(
+        "--template", type=Path, metavar="FILE", help="neutral vertices for an .npy (.npy, .npz or .obj)"
+    )
+    parser.add_argument(
+        "--fps", type=float, metavar="N", help="frames per second of the source, whatever it says itself"
+    )
+    parser.add_argument(
+        "--camera", default="static", metavar="static|orbit|FILE", help="camera path (default: static)"
+    )
+    parser.add_argument("--size", default="512x512", metavar="WxH", help="picture (default: 512x512)")
+    parser.add_argument("--frames", type=int, metavar="N", help="how many (default: the whole clip, once)")
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="out.mp4, frame_%%04d.png or one.png"
+    )
+    parser.add_argument("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
 
 
 def run_render(arguments: argparse.Namespace) -> None:
@@ -316,7 +407,7 @@ def add_inspect(commands) -> None:
     parser = command(
         commands, "inspect", run_inspect, "say what is in a .cap4d file", "cap4d inspect me.cap4d"
     )
-    parser.add_argument("avatar", type=Path, metavar="AVATAR.cap4d")
+    add_avatar(parser)
 
 
 def run_inspect(arguments: argparse.Namespace) -> None:

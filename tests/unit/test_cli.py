@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,8 @@ from cap4d.errors import exit_code
 
 COMMANDS = (
     ["demo"],
+    ["rig"],
+    ["rig", "import"],
     ["rig", "import", "flame"],
     ["rig", "import", "ict"],
     ["rig", "import", "builtin"],
@@ -31,6 +35,55 @@ def test_every_command_has_help_with_an_example(words: list[str], capsys: pytest
     assert stop.value.code == 0
     printed = capsys.readouterr().out
     assert f"example:\n  cap4d {' '.join(words)}" in printed
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """A parser and those of its commands."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                yield from parsers(each)
+
+
+def test_every_argument_has_help() -> None:
+    found = list(parsers(cli.build_parser()))
+    assert len(found) == 1 + len(COMMANDS)
+    for parser in found:
+        assert parser.description and parser.epilog, parser.prog
+        for action in parser._actions:
+            if not isinstance(action, argparse._SubParsersAction):
+                assert action.help, f"{parser.prog} {action.dest}"
+
+
+def test_fit_says_what_held_out_means(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert (
+        "held-out frames (every 10th and the last tenth of a video, or those the capture marks) are never "
+        "trained on; their expressions and poses come from the tracker, which sees all frames." in printed
+    )
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "rig import flame missing.pkl -o no/r.npz",
+        "rig import ict missing -o no/r.npz",
+        "rig import builtin -o no/r.npz",
+        "rig show missing.npz -o no/r.png",
+        "track missing.mp4 --rig missing.npz -o no/capture",
+        "fit missing --rig missing.npz -o no/me.cap4d",
+    ],
+)
+def test_the_output_is_checked_first(line: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    for package in ("torch", "OpenImageIO", "cv2"):
+        pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(line.split()) == 2
+    assert capsys.readouterr().err.startswith("cap4d: output: the folder of no/")
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_unknown_command_exits_with_2() -> None:
