@@ -110,7 +110,7 @@ SHORT_RATES = LearningRates(
     deformer_decay=0.0,
 )
 
-# One camera sees a head turn by a few degrees and says little about depth: Gaussians stay nearer to the surface,
+# A camera that sees a head turn by a few degrees says little about depth: Gaussians stay near the surface,
 # so that hair does not swim where the head goes on to turn (+0.1 dB on frames beyond the last trained one).
 NEAR_SURFACE = LossWeights(position=1e-2, position_limit=0.7)
 
