@@ -8,10 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from safetensors.numpy import load, save
+
 from cap4d.bundle.container import write_container
 from cap4d.bundle.manifest import digest
 from cap4d.bundle.schema import MANIFEST, ONNX
-from safetensors.numpy import load, save
 
 
 class Forge:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from cap4d.camera import Camera, orbit_camera
 from cap4d.gaussians import Gaussians
 

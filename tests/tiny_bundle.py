@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from cap4d.bundle import Bundle
 from cap4d.camera import orbit_camera
 from cap4d.drive.clip import Clip

@@ -71,9 +71,9 @@ class FlameModel:
 def import_flame(model: Path, assets: Path | None = None, *, compat_pose_offset: bool = True) -> HeadRig:
     """Makes a rig of a FLAME pickle.
 
-    Editions with a jaw of their own are known by their files' names (`generic_model.pkl` is FLAME 2020); there
-    the lower mouth turns with `jaw_rot`. Any other model with the released assets, whatever its file is called,
-    is `flame2023_no_jaw`, where it turns with the expression (fact 13).
+    Editions with a jaw of their own are known by their files' names (`generic_model.pkl` is FLAME 2020);
+    there the lower mouth turns with `jaw_rot`. Any other model with the released assets, whatever its file
+    is called, is `flame2023_no_jaw`, where it turns with the expression (fact 13).
 
     Args:
         model: FLAME's .pkl.

@@ -16,6 +16,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+
 from cap4d import _core
 from cap4d.camera import Camera
 from cap4d.gaussians import Gaussians

@@ -85,7 +85,8 @@ def test_codetalker_vertices_give_back_the_expressions(shared: Path, road: Path)
     assert moved < 1e-3
     out = road / "speech.mp4"
     run("view", road / "tesla.cap4d", "--headless", "--backend", "cpu", "--size", "96x96",
-        "--frames", 12, "--drive", source,        "--template", shared / "flame/codetalker/truth.npz", "--out", out)  # fmt: skip
+        "--frames", 12, "--drive", source,
+        "--template", shared / "flame/codetalker/truth.npz", "--out", out)  # fmt: skip
     assert len(decoded(out)) == 12
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from tiny_bundle import tiny_bundle
+
 from cap4d import _core
 from cap4d.bind import bind_fast
 from cap4d.camera import Camera, opencv_from_rig, orbit_camera
@@ -19,8 +21,6 @@ from cap4d.player.avatar import Avatar
 from cap4d.render import render
 from cap4d.rig.builtin import build_head
 from cap4d.rig.grid import build_grid, remesh
-
-from tiny_bundle import tiny_bundle
 
 NO_DRIVER = 77  # exit code
 

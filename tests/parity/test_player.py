@@ -9,10 +9,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
-from cap4d.bundle import Bundle, read_bundle, write_bundle
-from cap4d.gaussians import Gaussians
-from cap4d.player.avatar import Avatar
-from cap4d.render import render
+from tiny_bundle import tiny_bundle
 from tolerances import (
     PLAYER_HALF_DB,
     PLAYER_MEANS,
@@ -23,7 +20,10 @@ from tolerances import (
     PLAYER_VERTICES,
 )
 
-from tiny_bundle import tiny_bundle
+from cap4d.bundle import Bundle, read_bundle, write_bundle
+from cap4d.gaussians import Gaussians
+from cap4d.player.avatar import Avatar
+from cap4d.render import render
 
 FLIP = np.array([1.0, -1.0, -1.0])
 CASES = {

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from parity import tolerances as tol
+from splat_scenes import SCENES, cloud, view
+
 from cap4d import _core
 from cap4d.camera import Camera
 from cap4d.gaussians import Gaussians
 from cap4d.raster import Rasterized, rasterize, reference
-
-from parity import tolerances as tol
-from splat_scenes import SCENES, cloud, view
 
 BACKGROUND = (1.0, 0.5, 0.2)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")

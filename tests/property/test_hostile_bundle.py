@@ -14,14 +14,14 @@ import pytest
 pytest.importorskip("onnx")
 
 import onnx
+from bundle_forge import Forge
+from tiny_bundle import tiny_bundle
+
 from cap4d.bundle import Bundle, read_bundle, write_bundle
 from cap4d.bundle.container import CENTRAL_MAGIC, LOCAL_MAGIC
 from cap4d.bundle.onnx_scan import scan_onnx
 from cap4d.bundle.schema import GAUSSIANS, GRID, IDLE, MANIFEST, ONNX, PREVIEW, RIG
 from cap4d.errors import DataError
-
-from bundle_forge import Forge
-from tiny_bundle import tiny_bundle
 
 SIZE = 8
 

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cap4d.rig.head import HeadRig, MouthPlacement
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from cap4d.rig.head import HeadRig, MouthPlacement
 
 V, S, E = 7, 3, 4
 DRIVERS = ("neck", "jaw", "eyes", "expr")

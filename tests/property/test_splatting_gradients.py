@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from parity import tolerances as tol
+from splat_scenes import cloud, view
+
 from cap4d.gaussians import Gaussians
 from cap4d.raster import rasterize
 from cap4d.raster.reference import rasterize_reference
 from cap4d.render import render
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
-from parity import tolerances as tol
-from splat_scenes import cloud, view
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -15,12 +15,12 @@ from cap4d.app.live import LivePlayer, ReadOut, choose_renderer
 from cap4d.app.play_clock import PlayClock
 from cap4d.app.renderers import CpuRenderer, GlRenderer
 from cap4d.app.window import DisplayUnavailableError, Window, _key, _press
+from tiny_bundle import tiny_bundle
+
 from cap4d.bundle import write_bundle
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import camera_path
 from cap4d.player.offline import head_centre
-
-from tiny_bundle import tiny_bundle
 
 HERE = Path(__file__).resolve().parent
 

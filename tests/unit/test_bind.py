@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from parity import tolerances as tol
+
 from cap4d.bind import bind, bind_fast, triangle_frames
 from cap4d.rotation import axis_angle_to_rotmat, quat_to_rotmat
-
-from parity import tolerances as tol
 
 
 def mesh(seed: int = 0, vertices: int = 60, faces: int = 90) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from cap4d.camera import opencv_from_rig, orbit_camera
 from cap4d.mesh import shade
 from cap4d.rig.builtin import build_head, build_mesh

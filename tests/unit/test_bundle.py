@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from tiny_bundle import tiny_bundle, tiny_mesh
+
 from cap4d.bundle import Bundle, describe, read_bundle, read_manifest, schema, write_bundle
 from cap4d.bundle.onnx_scan import scan_onnx
 from cap4d.bundle.schema import GAUSSIANS, GRID, IDLE, RIG, TENSORS, stored_dtype, stored_shape
@@ -21,8 +23,6 @@ from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError, DataError
 from cap4d.rig.grid import UvGrid
 from cap4d.rig.head import Subject
-
-from tiny_bundle import tiny_bundle, tiny_mesh
 
 GAUSSIAN_ARRAYS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -153,8 +153,9 @@ def test_the_float16_network_answers_alike(tmp_path: Path) -> None:
 
 def test_weights_beyond_float16_are_refused() -> None:
     import onnx
-    from cap4d.bundle.onnx_half import halve_weights
     from onnx import numpy_helper
+
+    from cap4d.bundle.onnx_half import halve_weights
 
     model = onnx.load_from_string(tiny_bundle(8).deform_onnx)
     weight = model.graph.initializer[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from cap4d import ArgumentError, Camera
 from cap4d.camera import head_fixed, is_rigid, opencv_from_rig, orbit_camera
 from cap4d.rotation import axis_angle_to_rotmat

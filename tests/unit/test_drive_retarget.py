@@ -10,14 +10,14 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from tiny_bundle import tiny_bundle, tiny_clip
+
 from cap4d.bundle import Bundle
 from cap4d.drive.clip import Clip
 from cap4d.drive.retarget import Retargeter
 from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
 from cap4d.rig.head import HeadRig
-
-from tiny_bundle import tiny_bundle, tiny_clip
 
 RNG = np.random.default_rng(3)
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
 from cap4d.errors import ArgumentError
 from cap4d.rig.flame import read_assets
 from cap4d.rig.grid import build_grid, remesh

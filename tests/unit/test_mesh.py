@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from cap4d import _core
 from cap4d.camera import orbit_camera
 from cap4d.mesh import rasterize_mesh, shade, vertex_normals

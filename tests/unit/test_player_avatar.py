@@ -12,12 +12,12 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from tiny_bundle import EXPRESSIONS, RIG_NAME, tiny_bundle
+
 import cap4d
 from cap4d.bundle import Bundle, write_bundle
 from cap4d.errors import ArgumentError, DataError
 from cap4d.player.avatar import Avatar
-
-from tiny_bundle import EXPRESSIONS, RIG_NAME, tiny_bundle
 
 ZERO = np.zeros(len(EXPRESSIONS), np.float32)
 OPEN = np.float32([1, 0, 0, 0, 0])

@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from tiny_bundle import tiny_grid, tiny_network
+
 from cap4d.errors import DataError
 from cap4d.player.deformer import Deformer, default_threads
-
-from tiny_bundle import tiny_grid, tiny_network
 
 SIZE = 8
 

@@ -6,13 +6,13 @@ import importlib.util
 
 import pytest
 import torch
+from splat_scenes import cloud, view
+from torch import Tensor
+
 from cap4d.camera import Camera
 from cap4d.errors import ArgumentError
 from cap4d.raster import Rasterized, rasterize
 from cap4d.raster.reference import rasterize_reference
-from torch import Tensor
-
-from splat_scenes import cloud, view
 
 
 def tensors(**options: float) -> list[Tensor]:

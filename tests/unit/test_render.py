@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from splat_scenes import cloud, view
+
 from cap4d import _core
 from cap4d.camera import Camera
 from cap4d.gaussians import Gaussians
 from cap4d.render import render
-
-from splat_scenes import cloud, view
 
 SH_C0 = 0.28209479177387814
 

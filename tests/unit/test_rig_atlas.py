@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from cap4d.rig.atlas import add_skirts, enlarge_busy, islands, place, unmirror, weld
 
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+
 from cap4d.rig.bust import BOTTOM_BELOW_ORIGIN, N_RINGS, grow_bust, open_edge
 
 L = 24

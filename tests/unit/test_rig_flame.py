@@ -9,6 +9,7 @@ import shutil
 
 import numpy as np
 import pytest
+
 from cap4d.camera import Camera, opencv_from_rig
 from cap4d.errors import ArgumentError, DataError
 from cap4d.rig.flame import BLINK, half_sphere, import_flame

@@ -6,6 +6,7 @@ import logging
 
 import numpy as np
 import pytest
+
 from cap4d.errors import DataError
 from cap4d.rig.grid import build_grid
 from cap4d.rig.head import HeadRig

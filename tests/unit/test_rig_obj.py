@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from cap4d.errors import DataError
 from cap4d.rig.obj import read_obj, read_obj_vertices, triangulate
 

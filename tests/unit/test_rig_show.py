@@ -6,6 +6,7 @@ import struct
 from dataclasses import replace
 
 import numpy as np
+
 from cap4d.rig.show import COLUMNS, TILE, contact_sheet, draw, head_camera, label, pictures
 
 

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+
 from cap4d.errors import ArgumentError, DataError
 from cap4d.rig.head import HeadRig, MouthPlacement
 from cap4d.rig.store import load_rig, save_rig

@@ -9,6 +9,7 @@ import types
 
 import numpy as np
 import pytest
+
 from cap4d.errors import DataError
 from cap4d.rig.unpickle import read_pickle
 

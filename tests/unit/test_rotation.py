@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from cap4d.rotation import (
     axis_angle_to_rotmat,
     quat_multiply,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from cap4d import _core
 
 FORWARD = np.eye(4, dtype=np.float32)

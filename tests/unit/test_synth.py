@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from cap4d.camera import opencv_from_rig
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError
