@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from cap4d.app.options import Options, parse_options
 
-from cap4d.bundle.reader import read_manifest
 from cap4d.errors import exit_code
 
 log = logging.getLogger(__name__)
@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0 success, 1 bad data or no OpenGL, 2 a bad argument, 130 interrupted."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    # one frame's matrix products are small: a second BLAS thread costs more than it gives
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options = parse_options(argv)
     return exit_code("cap4d-view", lambda: play(options))
 
@@ -28,6 +30,8 @@ def play(options: Options) -> None:
     Raises:
         DataError: There is no avatar, or it is not sound.
     """
+    from cap4d.bundle.reader import read_manifest
+
     avatar = options.avatar if options.avatar is not None else demo_avatar()
     read_manifest(avatar)  # before a window opens for what is no avatar
     if options.headless or options.out is not None or not play_in_window(avatar, options):

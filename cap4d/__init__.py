@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from cap4d.camera import Camera
 from cap4d.errors import ArgumentError, Cap4dError, DataError
-from cap4d.gaussians import Gaussians
 
 if TYPE_CHECKING:
+    from cap4d.camera import Camera
+    from cap4d.gaussians import Gaussians
     from cap4d.player.avatar import Avatar
 
 __version__ = "0.1.0"
 __all__ = ["ArgumentError", "Avatar", "Camera", "Cap4dError", "DataError", "Gaussians", "__version__"]
 
+# Imported when first asked for: onnxruntime takes 0.2 s, and programs choose NumPy's threads before it loads.
+LAZY = {"Avatar": "cap4d.player.avatar", "Camera": "cap4d.camera", "Gaussians": "cap4d.gaussians"}
+
 
 def __getattr__(name: str) -> Any:
-    if name == "Avatar":  # onnxruntime takes 0.2 s to import: only those who play pay
-        from cap4d.player.avatar import Avatar
-
-        return Avatar
+    if name in LAZY:
+        return getattr(import_module(LAZY[name]), name)
     raise AttributeError(f"module 'cap4d' has no attribute {name!r}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -388,6 +389,7 @@ def add_render(commands) -> None:
 
 
 def run_render(arguments: argparse.Namespace) -> None:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the viewer
     from cap4d.player.offline import render_file
 
     render_file(
