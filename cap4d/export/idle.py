@@ -8,9 +8,11 @@ import numpy as np
 
 from cap4d.drive.clip import Clip
 from cap4d.rig.head import HeadRig
+from cap4d.synth.idle import blinks, expression_vector
 from cap4d.synth.idle import idle_clip as invented_clip
 
 LONGEST, SHORTEST = 8.0, 1.5  # s
+SHUT = 0.6  # mean of the lids' weights that counts as a blink
 SEAM = 0.5  # s over which the end of the clip turns into its beginning
 FIELDS = ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra")
 
@@ -18,10 +20,11 @@ FIELDS = ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra")
 def idle_clip(clip: Clip, rig: HeadRig) -> Clip:
     """A clip that can repeat: from the capture's own where that is a film, else an invented one.
 
-    The invented one keeps the head where the capture's calmest frame has it.
+    A film in which nobody blinks (a short one, often) is given blinks: without them a face stares. The invented
+    one keeps the head where the capture's calmest frame has it.
     """
     if clip.duration >= SHORTEST and is_film(clip):
-        return looped(clip)
+        return blinking(looped(clip), rig)
     invented = invented_clip(rig)
     calm = int(np.abs(clip.expr).sum(1).argmin())
     held = {
@@ -35,6 +38,16 @@ def is_film(clip: Clip) -> bool:
     """Whether its frames follow each other in time: a frame then resembles the next more than any other."""
     spread = np.abs(clip.expr - clip.expr.mean(0)).sum()
     return float(np.abs(np.diff(clip.expr, axis=0)).sum()) < 0.5 * spread
+
+
+def blinking(clip: Clip, rig: HeadRig, *, seed: int = 0) -> Clip:
+    """The clip with invented blinks, where its rig has lids to close by name and they never come down."""
+    lids = expression_vector(rig, {"eyeBlink": 1.0, "blink": 1.0})
+    if not lids.any() or clip.expr[:, lids > 0].mean(1).max() > SHUT:
+        return clip
+    times = np.arange(len(clip)) / clip.fps
+    shut = blinks(np.random.default_rng(seed), times, clip.duration).astype(np.float32)[:, None] * lids
+    return replace(clip, expr=clip.expr * (1 - shut) + shut)
 
 
 def looped(clip: Clip) -> Clip:

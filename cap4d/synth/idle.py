@@ -108,7 +108,7 @@ def _by_name(
     expr += np.outer(smile, expression_vector(rig, SMILE))
     for start in rng.uniform(0.1 * seconds, talk_end, max(1, round(seconds / 4))):
         expr += np.outer(_bell(times, start, 0.28, seconds), expression_vector(rig, EMPHASIS))
-    blink = _blinks(rng, times, seconds)
+    blink = blinks(rng, times, seconds)
     expr += np.outer(blink, expression_vector(rig, {"eyeBlink": 1.0}))
     for t, turn in enumerate(gaze):
         expr[t] += (1 - blink[t]) * expression_vector(rig, look_weights(turn))
@@ -125,7 +125,7 @@ def _by_number(rig, rng: np.random.Generator, times: np.ndarray, seconds: float)
     falloff = 1 / (1 + np.arange(n) / 8)
     expr = np.clip(0.25 * _drift(rng, times, seconds, n), -0.5, 0.5) * falloff * (span[:, 1] - span[:, 0]) / 2
     blinking = [i for i, name in enumerate(rig.expression_names) if "blink" in name.lower()]
-    expr[:, blinking] = 0.93 * _blinks(rng, times, seconds)[:, None]
+    expr[:, blinking] = 0.93 * blinks(rng, times, seconds)[:, None]
     return np.clip(expr, span[:, 0], span[:, 1])
 
 
@@ -162,7 +162,7 @@ def _syllables(rng: np.random.Generator, start: float, end: float):
         at += width * 0.95 + (rng.random() < 0.14) * rng.uniform(0.15, 0.4)
 
 
-def _blinks(rng: np.random.Generator, times: np.ndarray, seconds: float) -> np.ndarray:
+def blinks(rng: np.random.Generator, times: np.ndarray, seconds: float) -> np.ndarray:
     """[T] how far the lids are closed, in [0, 1]; no blink is cut by the clip's ends."""
     closed = np.zeros(len(times))
     at = rng.uniform(0.5, 1.2)

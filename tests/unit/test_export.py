@@ -18,7 +18,7 @@ from cap4d.errors import Cap4dError
 from cap4d.export import bundle as bundle_module
 from cap4d.export.bundle import export_bundle
 from cap4d.export.deformer import export_deformer, worst_difference
-from cap4d.export.idle import idle_clip, is_film, looped
+from cap4d.export.idle import SHUT, blinking, idle_clip, is_film, looped
 
 
 def trained_looking(deformer, seed=0):
@@ -119,3 +119,17 @@ def test_stills_get_an_invented_clip_with_the_head_in_place(tmp_path):
     assert clip.duration > 2
     assert (clip.tra == stills.tra[0]).all()
     assert len(idle_clip(film, tiny_rig())) == 30
+
+
+def test_a_film_without_blinks_is_given_some_and_one_with_blinks_is_left_alone(builtin_rig):
+    from cap4d.synth.idle import expression_vector
+
+    lids = expression_vector(builtin_rig, {"eyeBlink": 1.0}) > 0
+    turns = {name: np.zeros((120, 3), np.float32) for name in ("eye_rot", "neck_rot", "jaw_rot")}
+    still = Clip("builtin", 30.0, np.full((120, len(lids)), 0.1, np.float32), **turns)
+    clip = blinking(still, builtin_rig)
+    shut = clip.expr[:, lids].mean(1)
+    assert shut.max() > 0.9 and np.median(shut) < 0.2
+    np.testing.assert_array_equal(clip.expr[:, ~lids], still.expr[:, ~lids])
+    assert shut.max() > SHUT
+    assert blinking(clip, builtin_rig) is clip
