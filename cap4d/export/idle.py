@@ -20,8 +20,8 @@ FIELDS = ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra")
 def idle_clip(clip: Clip, rig: HeadRig) -> Clip:
     """A clip that can repeat: from the capture's own where that is a film, else an invented one.
 
-    A film in which nobody blinks (a short one, often) is given blinks: without them a face stares. The invented
-    one keeps the head where the capture's calmest frame has it.
+    A film in which nobody blinks (a short one, often) is given blinks: without them a face stares. The
+    invented one keeps the head where the capture's calmest frame has it.
     """
     if clip.duration >= SHORTEST and is_film(clip):
         return blinking(looped(clip), rig)
