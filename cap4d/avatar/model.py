@@ -124,15 +124,22 @@ class AvatarModel(nn.Module):
         posed = self.subject.pose(p.expr, eye_rot=p.eye_rot, neck_rot=p.neck_rot, jaw_rot=p.jaw_rot)
         return opencv_from_rig(posed)
 
-    def pose(self, pose: Pose, *, rigid: tuple[torch.Tensor, torch.Tensor] | None = None) -> Posed:
+    def pose(
+        self,
+        pose: Pose,
+        *,
+        rigid: tuple[torch.Tensor, torch.Tensor] | None = None,
+        network_pose: Pose | None = None,
+    ) -> Posed:
         """The Gaussians for a pose.
 
         Args:
             rigid: Rotation [3, 3] and translation [3] applied to the whole head, to correct a tracked head
                 pose.
+            network_pose: What the network sees, if not `pose`.
         """
         surface = self.surface(pose)
-        deformation = None if self.deformer is None else self.deform(self.offsets(pose))
+        deformation = None if self.deformer is None else self.deform(self.offsets(network_pose or pose))
         vertices = surface if deformation is None else surface + deformation.moved
         if rigid is not None:
             vertices = vertices @ rigid[0].T + rigid[1]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ class Trainer:
         """Takes one step and returns its loss."""
         self._set_rates()
         view = self.views[self._view_index()]
-        posed, rendered = self.render(view)
+        posed, rendered = self.render(view, noise=self.preset.expression_noise)
         loss = self._loss(view, posed, rendered)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -82,14 +83,19 @@ class Trainer:
         self._refine()
         return loss.item()
 
-    def posed(self, view: FitView) -> Posed:
-        """The avatar as it stands in a view, with the corrections of its frame."""
-        corrected = self.corrections[view.capture].at(view.frame)
-        return self.model.pose(corrected.pose, rigid=corrected.rigid)
+    def render(self, view: FitView, *, noise: float = 0.0) -> tuple[Posed, Rasterized]:
+        """The avatar as it should look in a view, with the corrections of its frame.
 
-    def render(self, view: FitView) -> tuple[Posed, Rasterized]:
-        """The avatar as it should look in a view."""
-        posed = self.posed(view)
+        Args:
+            noise: Standard deviation of what is added to the expression that the network sees, rig units.
+        """
+        corrected = self.corrections[view.capture].at(view.frame)
+        pose = seen = corrected.pose
+        if noise > 0:
+            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
+            jitter = noise * torch.randn(pose.expr.shape, generator=generator)
+            seen = replace(pose, expr=pose.expr.detach() + jitter)
+        posed = self.model.pose(pose, rigid=corrected.rigid, network_pose=seen)
         rendered = rasterize(
             posed.means,
             posed.quats,

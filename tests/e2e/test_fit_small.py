@@ -24,6 +24,7 @@ TINY = replace(
     grid_size=GRID,
     deformer_width=4,
     gaussians=600,
+    expression_noise=0.02,
     densify=Densify(start=30, stop=90, every=30, most=800),
     checkpoint_every=20,
 )
