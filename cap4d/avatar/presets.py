@@ -140,7 +140,7 @@ PRESETS = {
         per_face=1,
         sh_degree=1,
         sh_every=800,
-        expression_noise=0.05,
+        expression_noise=0.1,
         densify=Densify(start=200, stop=1_800, every=100, most=90_000, split_scale=0.003),
         rates=SHORT_RATES,
         weights=NEAR_SURFACE,
