@@ -106,3 +106,15 @@ def isa() -> Literal["base", "v3", "v4"]:
 
 def default_threads() -> int:
     """What `threads=0` means: the hardware's, or CAP4D_THREADS."""
+
+def multiply_add_rate(threads: int, seconds: float = 0.3) -> float:
+    """The machine's float32 operations a second; a multiply-add is two. Best of about `seconds`."""
+
+def copy_rate(bytes: int, threads: int, seconds: float = 0.3) -> float:
+    """Bytes read and written a second by copies that touch `bytes` in all."""
+
+def read_rate(bytes: int, threads: int, seconds: float = 0.3) -> float:
+    """Bytes a second of reading `bytes` again and again."""
+
+def sort_pass_rate(count: int, threads: int, seconds: float = 0.3) -> float:
+    """Keys a second through one pass of an 8-bit radix sort of `count` keys and values a thread."""
