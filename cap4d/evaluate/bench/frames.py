@@ -1,0 +1,204 @@
+"""Whole frames on the CPU: how many a second, how even, how much memory, and what each shortcut costs in the
+picture.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cap4d.camera import Camera
+from cap4d.drive.clip import Frame
+from cap4d.evaluate.bench.accuracy import picture_error
+from cap4d.evaluate.bench.child import ChildError, in_child
+from cap4d.evaluate.bench.settings import Settings
+from cap4d.evaluate.bench.tiers import clip_frames, load_tiers
+from cap4d.evaluate.bench.tiled import render_tiled
+from cap4d.evaluate.bench.timing import Timing
+from cap4d.evaluate.image import mse, pooled_psnr
+from cap4d.gaussians import SH_COUNTS, Gaussians
+from cap4d.player.avatar import Avatar
+from cap4d.player.offline import WHITE, draw_on_cpu, render_clip
+from cap4d.player.stages import peak_memory_mb
+
+log = logging.getLogger(__name__)
+
+SIDE = 512  # px
+SMALLER_SIDES = (384, 256)  # px, drawn smaller and enlarged, for the Pareto plot
+BLOCK = 25  # frames of one tier in a row, before the next tier's turn
+WARM_UP = 2  # frames of each block that do not count
+
+
+def measure_frames(path: Path, settings: Settings) -> dict[str, Any]:
+    """One avatar: a row per tier, and the configurations of the Pareto plot."""
+    log.info("frame: %s", path)
+    tiers = load_tiers(path, threads=settings.threads)
+    first = next(iter(tiers.values()))
+    camera = first.camera.resized(SIDE, SIDE)
+    log.info("frame: %s: the truth in float64", path)
+    samples = clip_frames(first.bundle, settings.samples)
+    truths = [true_picture(pose_of(first, frame), camera) for frame in samples]
+    for avatar in tiers.values():
+        avatar.stages.clear()
+    seconds = time_blocks({tier: _player(avatar, camera) for tier, avatar in tiers.items()}, settings.frames)
+    rows = []
+    for tier, avatar in tiers.items():
+        timing = Timing(tuple(seconds[tier]))
+        rows.append(
+            {
+                "tier": tier,
+                "name": tier,
+                "fps": round(len(timing.seconds) / sum(timing.seconds), 2),
+                **timing.report(),
+                "p99_over_median": round(timing.report()["p99_ms"] / timing.median_ms, 3),
+                "stages": avatar.stages.report(),
+                **pixel_error(avatar, samples, truths, camera),
+                **_memory(path, tier, settings),
+            }
+        )
+    return {
+        "avatar": path.name,
+        "gaussians": len(first.bundle),
+        "sh_degree": SH_COUNTS[first.bundle.sh.shape[1]],
+        "side": SIDE,
+        "truth": next(iter(tiers)),
+        "samples": len(samples),
+        "tiers": rows,
+        "configurations": _configurations(tiers, samples, truths, camera, settings),
+    }
+
+
+def true_picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """float64 [H, W, 3] on white, in the range that a screen shows."""
+    return np.clip(render_tiled(gaussians, camera).over(WHITE), 0, 1)
+
+
+def pose_of(avatar: Avatar, frame: Frame) -> Gaussians:
+    return avatar.pose(frame.expr, eye_rot=frame.eye_rot, neck_rot=frame.neck_rot, jaw_rot=frame.jaw_rot)
+
+
+def pixel_error(
+    avatar: Avatar, samples: list[Frame], truths: list[np.ndarray], camera: Camera
+) -> dict[str, float]:
+    """Of the 8-bit pictures of an avatar, drawn with `camera` and enlarged where that is smaller than the
+    truth: PSNR of the squared error pooled over all samples, and the largest difference.
+    """
+    errors, largest = [], 0.0
+    for frame, truth in zip(samples, truths, strict=True):
+        image = draw_on_cpu(avatar, frame, camera)[..., :3].astype(np.float64) / 255
+        image = enlarged(image, truth.shape[0])
+        errors.append(mse(image, truth))
+        largest = max(largest, picture_error(image, truth)["max_255"])
+    return {"psnr_db": round(min(pooled_psnr(np.array(errors)), 999.0), 2), "max_255": round(largest, 2)}
+
+
+def enlarged(image: np.ndarray, side: int) -> np.ndarray:
+    """A square picture on more pixels, interpolated linearly between the pixel centres."""
+    old = len(image)
+    if old == side:
+        return image
+    at = np.clip((np.arange(side) + 0.5) * old / side - 0.5, 0, old - 1)
+    low = np.minimum(at.astype(int), old - 2)
+    share = (at - low)[:, None, None]
+    rows = image[low] * (1 - share) + image[low + 1] * share
+    share = share[None, :, 0]
+    return rows[:, low] * (1 - share) + rows[:, low + 1] * share
+
+
+def time_blocks(players: dict[str, Iterator[np.ndarray]], frames: int) -> dict[str, list[float]]:
+    """Seconds of `frames` frames of each player, in blocks that take turns: within a block nothing else is
+    run.
+
+    A frame's time is from one picture to the next, as a viewer waits for it.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in players}
+    while any(len(times) < frames for times in seconds.values()):
+        for name, player in players.items():
+            wanted = min(BLOCK - WARM_UP, frames - len(seconds[name]))
+            for _ in range(WARM_UP):
+                next(player)
+            last = time.perf_counter()
+            for _ in range(wanted):
+                next(player)
+                now = time.perf_counter()
+                seconds[name].append(now - last)
+                last = now
+    return seconds
+
+
+def memory_alone(*, path: str, tier: str, threads: int, frames: int) -> dict[str, float]:
+    """A process that does nothing else than play: its memory at its peak after a few and after all frames,
+    MB.
+    """
+    avatar = Avatar.load(path, deformer=tier, threads=threads)
+    player = _player(avatar, avatar.camera.resized(SIDE, SIDE))
+    for _ in range(5):
+        next(player)
+    early = peak_memory_mb()
+    for _ in range(frames):
+        next(player)
+    return {"memory_mb": round(peak_memory_mb(), 1), "memory_grown_mb": round(peak_memory_mb() - early, 1)}
+
+
+def _player(avatar: Avatar, camera: Camera) -> Iterator[np.ndarray]:
+    """The idle clip for ever, through the same loop that writes videos."""
+    return render_clip(avatar, avatar.idle, lambda index, frame: camera, frames=1 << 30)
+
+
+def _memory(path: Path, tier: str, settings: Settings) -> dict[str, float]:
+    try:
+        return in_child(
+            "frame", path=str(path), tier=tier, threads=settings.threads, frames=settings.short_runs
+        )
+    except ChildError as error:
+        log.warning("frame: %s in a process of its own: %s", tier, error)
+        return {}
+
+
+def _configurations(
+    tiers: dict[str, Avatar],
+    samples: list[Frame],
+    truths: list[np.ndarray],
+    camera: Camera,
+    settings: Settings,
+) -> list[dict[str, Any]]:
+    """Every tier at every SH degree, and every tier drawn smaller: time and error of each."""
+    log.info("frame: configurations")
+    degree = SH_COUNTS[next(iter(tiers.values())).bundle.sh.shape[1]]
+    plans = [(tier, d, SIDE) for tier in tiers for d in range(degree + 1)]
+    plans += [(tier, degree, side) for tier in tiers for side in SMALLER_SIDES]
+    avatars = {plan: _reduced(tiers[plan[0]], plan[1], settings) for plan in plans}
+    views = {plan: camera.resized(plan[2], plan[2]) for plan in plans}
+    seconds = time_blocks(
+        {str(plan): _player(avatars[plan], views[plan]) for plan in plans}, settings.short_runs
+    )
+    return [
+        {
+            "tier": tier,
+            "sh_degree": d,
+            "side": side,
+            "median_ms": round(Timing(tuple(seconds[str((tier, d, side))])).median_ms, 3),
+            **pixel_error(avatars[tier, d, side], samples, truths, views[tier, d, side]),
+        }
+        for tier, d, side in plans
+    ]
+
+
+def _reduced(avatar: Avatar, degree: int, settings: Settings) -> Avatar:
+    """The same avatar and tier with SH up to a degree."""
+    count = (degree + 1) ** 2
+    if count == avatar.bundle.sh.shape[1]:
+        return avatar
+    bundle = replace(avatar.bundle, sh=np.ascontiguousarray(avatar.bundle.sh[:, :count]))
+    return Avatar(bundle, deformer=_tier(avatar), threads=settings.threads)
+
+
+def _tier(avatar: Avatar) -> str:
+    """The name of its tier."""
+    return avatar.tier if hasattr(avatar, "tier") else ("off" if avatar.deformer is None else "full")
