@@ -30,7 +30,7 @@ def new_figure(path: Path) -> Iterator[Any]:
 
 def add_axes(figure: Any, where: Any, title: str, x: str, y: str) -> Any:
     axes = figure.add_subplot(*where) if isinstance(where, tuple) else figure.add_subplot(where)
-    axes.setadd_title(title, fontsize=11, color=INK, loc="left")
+    axes.set_title(title, fontsize=11, color=INK, loc="left")
     axes.set_xlabel(x, color=INK)
     axes.set_ylabel(y, color=INK)
     axes.grid(color=GRID, linewidth=0.8)
