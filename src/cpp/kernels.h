@@ -14,6 +14,11 @@ struct Image {  // caller-owned, row major
   float* depth;  // [H, W] expected depth m: sum of w_i z_i over alpha, 0 where alpha is 0
 };
 
+struct Image8 {  // caller-owned
+  std::uint8_t* rgba;  // [H, W, 4] rounded
+  bool straight;       // colour divided by alpha, without a background; else composited on it, alpha 255
+};
+
 struct ImageGrad {
   const float *rgb, *alpha, *depth;  // alpha and depth may be null: no gradient
 };
@@ -43,6 +48,7 @@ struct Kernels {
   void (*project_bwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, const std::int32_t* radii, const PairGrads&,
                       const GaussianGrads&);
   void (*rasterize_fwd)(const TileJob&, const Image&);
+  void (*rasterize_rgba8)(const TileJob&, const Image8&);
   // Writes grads[slots[i]] for each i of the job.
   void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t* slots, SplatGrad* grads);
 };

@@ -10,6 +10,7 @@ namespace cap4d::CAP4D_ISA {
 
 extern const Kernels kKernels;
 void rasterize_fwd(const TileJob&, const Image&);
+void rasterize_rgba8(const TileJob&, const Image8&);
 void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t*, SplatGrad*);
 
 namespace {
@@ -248,6 +249,6 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
 
 }  // namespace
 
-const Kernels kKernels = {CAP4D_NAME(CAP4D_ISA), &project_fwd, &project_bwd, &rasterize_fwd, &rasterize_bwd};
+const Kernels kKernels = {CAP4D_NAME(CAP4D_ISA), &project_fwd, &project_bwd, &rasterize_fwd, &rasterize_rgba8, &rasterize_bwd};
 
 }  // namespace cap4d::CAP4D_ISA

@@ -57,6 +57,7 @@ CAP4D_INLINE FloatV select(MaskV m, FloatV yes, FloatV no) { return _mm512_mask_
 CAP4D_INLINE FloatV keep(MaskV m, FloatV v) { return _mm512_maskz_mov_ps(m, v); }
 CAP4D_INLINE std::uint32_t bits(MaskV m) { return m; }
 CAP4D_INLINE MaskV both(MaskV a, MaskV b) { return static_cast<MaskV>(a & b); }
+CAP4D_INLINE MaskV less_equal_in(MaskV where, FloatV a, FloatV b) { return _mm512_mask_cmp_ps_mask(where, a, b, _CMP_LE_OQ); }
 CAP4D_INLINE MaskV first_only(MaskV a, MaskV b) { return static_cast<MaskV>(a & ~b); }
 CAP4D_INLINE FloatV sqrt(FloatV v) { return _mm512_sqrt_ps(v); }
 CAP4D_INLINE FloatV min(FloatV a, FloatV b) { return _mm512_min_ps(a, b); }
@@ -69,6 +70,7 @@ CAP4D_INLINE FloatV select(MaskV m, FloatV yes, FloatV no) { return m ? yes : no
 CAP4D_INLINE FloatV keep(MaskV m, FloatV v) { return as_float(m & as_int(v)); }
 CAP4D_INLINE MaskV both(MaskV a, MaskV b) { return a & b; }
 CAP4D_INLINE MaskV first_only(MaskV a, MaskV b) { return a & ~b; }
+CAP4D_INLINE MaskV less_equal_in(MaskV where, FloatV a, FloatV b) { return where & (a <= b); }
 #ifdef __AVX2__
 CAP4D_INLINE std::uint32_t bits(MaskV m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(as_float(m))); }
 CAP4D_INLINE FloatV sqrt(FloatV v) { return _mm256_sqrt_ps(v); }
@@ -91,17 +93,28 @@ CAP4D_INLINE FloatV max(FloatV a, FloatV b) { return a > b ? a : b; }
 
 CAP4D_INLINE bool any(MaskV m) { return bits(m) != 0; }
 
-// 2^x for x <= 0, relative error below 3e-7: a degree 5 minimax polynomial on [-0.5, 0.5], the integer added to the exponent.
-CAP4D_INLINE FloatV exp2_nonpositive(FloatV x) {
-  x = max(x, splat(-125.0f));
+// 2^x for x in [-125, 126], relative error below 2e-7: a degree 5 minimax polynomial (relative, by linear programming) on one
+// octave, the integer added to the exponent. Beyond, and for NaN, rubbish.
+CAP4D_INLINE FloatV exp2_in_range(FloatV x) {
+#ifdef CAP4D_AVX512
+  constexpr int kFloor = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+  const FloatV f = _mm512_reduce_ps(x, kFloor);  // x - floor(x)
+  FloatV p = f * 1.881429651e-3f + 8.980025032e-3f;
+  p = p * f + 5.583399171e-2f;
+  p = p * f + 2.401512769e-1f;
+  p = p * f + 6.931532616e-1f;
+  p = p * f + 9.999999346e-1f;
+  return _mm512_scalef_ps(p, x);
+#else
   const FloatV shifted = x + 12582912.0f;  // 1.5 * 2^23: the low mantissa bits now hold round(x)
   const FloatV f = x - (shifted - 12582912.0f);
-  FloatV p = f * 1.327647154e-3f + 9.675541352e-3f;
-  p = p * f + 5.550713275e-2f;
-  p = p * f + 2.402211972e-1f;
-  p = p * f + 6.931469671e-1f;
-  p = p * f + 1.000000072f;
+  FloatV p = f * 1.327692934e-3f + 9.675559861e-3f;
+  p = p * f + 5.550711605e-2f;
+  p = p * f + 2.402211987e-1f;
+  p = p * f + 6.93146969e-1f;
+  p = p * f + 1.000000071f;
   return as_float(as_int(p) + (as_int(shifted) << 23));
+#endif
 }
 
 // log2(x) for normal x > 0, absolute error below 2e-7 near 1 (Cephes logf).
