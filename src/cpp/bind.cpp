@@ -6,7 +6,7 @@
 
 #include "constants.h"
 #include "parallel.h"
-#include "tiles.h"
+#include "scratch.h"
 
 namespace cap4d {
 namespace {

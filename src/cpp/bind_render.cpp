@@ -84,7 +84,8 @@ py::tuple render(FloatArray means, FloatArray quats, FloatArray scales, FloatArr
   const Image out = image.view();
   {
     py::gil_scoped_release release;
-    render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kPlay, threads, out);
+    Rendered rendered;
+    render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kPlay, threads, out, rendered);
   }
   return py::make_tuple(image.rgb, image.alpha, image.depth);
 }
@@ -103,7 +104,7 @@ py::tuple rasterize(FloatArray means, FloatArray quats, FloatArray scales, Float
   std::int32_t* radius = radii.mutable_data();
   {
     py::gil_scoped_release release;
-    *rendered = render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kTrain, threads, out);
+    render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kTrain, threads, out, *rendered);
     std::copy_n(rendered->radii.get(), n, radius);
     for (py::ssize_t i = 0; i < n; ++i) {
       const bool drawn = radius[i] > 0;
@@ -143,7 +144,7 @@ py::tuple rasterize_vjp(const Rendered& rendered, FloatArray means, FloatArray q
 void register_render(py::module_& m) {
   py::class_<Rendered>(m, "Rendered", "What the forward pass leaves for the gradient.")
       .def_property_readonly("drawn", [](const Rendered& r) { return r.drawn; })
-      .def_property_readonly("pairs", [](const Rendered& r) { return r.pairs.count; });
+      .def_property_readonly("pairs", [](const Rendered& r) { return r.pairs; });
   const auto means = py::arg("means").noconvert();
   const auto quats = py::arg("quats").noconvert();
   const auto scales = py::arg("scales").noconvert();

@@ -45,6 +45,12 @@ struct TileBox {
   std::int16_t x0, x1, y0, y1;
 };
 
+// A Gaussian's pairs with the tiles it meets, counted from the first of its piece of work; and where its list of tiles begins there,
+// if it has one.
+struct PairRun {
+  std::uint32_t first, count, listed;
+};
+
 // Sums over the pixels of one tile (or of the image) of what one Gaussian receives.
 // s = dL/d(ln alpha) at a pixel; its moments about the mean in dx and u = dy - shear dx give the gradients of position, covariance
 // and opacity.

@@ -33,10 +33,10 @@ struct TileJob {
   const float* background;  // [3]
 };
 
-// What Gaussian i received in each of its tiles: grads[offsets[i]] up to grads[offsets[i + 1]].
+// What Gaussian i received in each of its tiles: grads[runs[i].first], runs[i].count of them.
 struct PairGrads {
   const SplatGrad* grads;
-  const std::uint32_t* offsets;  // [N + 1]
+  const PairRun* runs;  // [N] where drawn
 };
 
 struct Kernels {

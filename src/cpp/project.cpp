@@ -137,7 +137,8 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
 // Sum of a Gaussian's per-tile gradients, in the order its tiles were listed.
 CAP4D_INLINE SplatGrad total(const PairGrads& pairs, std::size_t id) {
   SplatGrad sum{};
-  for (std::uint32_t k = pairs.offsets[id]; k < pairs.offsets[id + 1]; ++k) {
+  const PairRun run = pairs.runs[id];
+  for (std::uint32_t k = run.first; k < run.first + run.count; ++k) {
     const SplatGrad& v = pairs.grads[k];
     sum.red += v.red, sum.green += v.green, sum.blue += v.blue, sum.depth += v.depth;
     sum.s += v.s, sum.sx += v.sx, sum.su += v.su, sum.sxx += v.sxx, sum.sxu += v.sxu, sum.suu += v.suu;
