@@ -89,6 +89,15 @@ void bind(const float* vertices, const BoundGaussians& bound, int threads, float
   });
 }
 
+void upright(const float* axes, float* rotmat) {
+  float q[4];
+  rotmat_to_quat(axes, q);
+  const float w = q[0], x = q[1], y = q[2], z = q[3];
+  const float r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+                      2 * (y * z - w * x),     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
+  std::copy_n(r, 9, rotmat);
+}
+
 // backward ------------------------------------------------------------------------------------------------------------------
 
 namespace {

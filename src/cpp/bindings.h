@@ -7,4 +7,5 @@ void register_bind(pybind11::module_& m);
 void register_mesh(pybind11::module_& m);
 void register_render(pybind11::module_& m);
 void register_sort(pybind11::module_& m);
+void register_splatter(pybind11::module_& m);
 }  // namespace cap4d

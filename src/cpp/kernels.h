@@ -5,6 +5,7 @@
 
 #include "camera.h"
 #include "gaussians.h"
+#include "packed.h"
 
 namespace cap4d {
 
@@ -45,6 +46,11 @@ struct Kernels {
   // and their boxes [end - begin].
   void (*project_fwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii,
                       TileBox* boxes);
+  // The same of prepared Gaussians; begin is a multiple of kPack. frames [faces] where they are bound.
+  void (*project_packed)(const Camera&, const Packed&, const TriangleFrame* frames, std::size_t begin, std::size_t end, Splat* splats,
+                         std::int32_t* radii, TileBox* boxes);
+  // The places of triangles [begin, end) of faces [M, 3] into vertices [G, 3].
+  void (*triangle_frames)(const float* vertices, const std::int32_t* faces, std::size_t begin, std::size_t end, TriangleFrame* frames);
   void (*project_bwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, const std::int32_t* radii, const PairGrads&,
                       const GaussianGrads&);
   void (*rasterize_fwd)(const TileJob&, const Image&);

@@ -7,4 +7,5 @@ PYBIND11_MODULE(_core, m) {
   cap4d::register_mesh(m);
   cap4d::register_render(m);
   cap4d::register_sort(m);
+  cap4d::register_splatter(m);
 }

@@ -71,10 +71,7 @@ struct Meetings {
   BlockSet gaussians[kChunk];
 };
 
-constexpr int kOutlineFields = 7;  // the first of Splat
-static_assert(offsetof(Splat, inv_height2) == 4 * (kOutlineFields - 1));
-
-struct Outlines {  // of kLanes Gaussians
+struct Outlines {  // of kLanes Gaussians; in the order of Splat
   FloatV x, y, half_height, slope, y_rightmost, half_width2, inv_height2;
 };
 
@@ -82,14 +79,18 @@ struct Outlines {  // of kLanes Gaussians
 constexpr std::size_t kPrefetch = 2 * kLanes;
 
 CAP4D_INLINE Outlines gather_outlines(const TileJob& job, std::size_t first, int count) {
-  float lanes[kOutlineFields][kLanes];
+  const float* rows[kLanes];
   for (int l = 0; l < kLanes; ++l) {
     const std::size_t i = first + (l < count ? l : count - 1);
     if (i + kPrefetch < job.count) __builtin_prefetch(&job.splats[job.isects[i + kPrefetch]]);
-    const float* fields = &job.splats[job.isects[i]].x;
-    for (int f = 0; f < kOutlineFields; ++f) lanes[f][l] = fields[f];
+    rows[l] = &job.splats[job.isects[i]].x;
   }
-  return {load(lanes[0]), load(lanes[1]), load(lanes[2]), load(lanes[3]), load(lanes[4]), load(lanes[5]), load(lanes[6])};
+  FloatV fields[8];
+  load_rows8(rows, fields);
+  Outlines outlines;
+  static_assert(sizeof outlines == 7 * sizeof(FloatV) && offsetof(Splat, inv_height2) == 6 * sizeof(float));
+  std::memcpy(&outlines, fields, sizeof outlines);
+  return outlines;
 }
 
 // Blocks that an outline meets, exact for their pixel centres' rows and columns: the widest chord of an ellipse within a band is at

@@ -1,6 +1,7 @@
 #include "render.h"
 
 #include <bit>
+#include <chrono>
 #include <stdexcept>
 
 #include "parallel.h"
@@ -11,10 +12,23 @@ namespace {
 constexpr std::size_t kGrain = 1024;  // Gaussians per piece of work
 constexpr std::uint64_t kMaxPairs = 1ull << 31;
 
+class Stopwatch {
+ public:
+  double lap() {  // s since the last, or since it was made
+    const Clock::time_point now = Clock::now();
+    return std::chrono::duration<double>(now - std::exchange(last_, now)).count();
+  }
+
+ private:
+  using Clock = std::chrono::steady_clock;
+  Clock::time_point last_ = Clock::now();
+};
+
 // Splats and tiles of Gaussians [begin, end); those drawn are noted from `order[begin]` on.
-void project_piece(Rendered& r, const GaussiansView& gaussians, std::size_t begin, std::size_t end, Piece& piece) {
+template <class Project>
+void project_piece(Rendered& r, const Project& project, std::size_t begin, std::size_t end, Piece& piece) {
   TileBox boxes[kGrain];
-  kernels().project_fwd(r.camera, gaussians, begin, end, r.splats.get(), r.radii.get(), boxes);
+  project(begin, end, boxes);
   piece.tiles.clear();
   Drawn* next = &r.order[begin];
   std::uint32_t pairs = 0;
@@ -46,12 +60,13 @@ void join_pieces(Rendered& r) {
   r.pairs = static_cast<std::uint32_t>(pairs);
 }
 
-void project_all(Rendered& r, const GaussiansView& gaussians, int threads) {
-  const std::size_t count = gaussians.count;
+// project(begin, end, boxes) fills the splats, radii and boxes of a piece.
+template <class Project>
+void project_all(Rendered& r, std::size_t count, int threads, const Project& project) {
   r.count = count;
   r.radii.reserve(count), r.splats.reserve(count), r.runs.reserve(count), r.order.reserve(count);
   r.pieces.resize((count + kGrain - 1) / kGrain);
-  parallel_for(count, kGrain, threads, [&](std::size_t begin, std::size_t end) { project_piece(r, gaussians, begin, end, r.pieces[begin / kGrain]); });
+  parallel_for(count, kGrain, threads, [&](std::size_t begin, std::size_t end) { project_piece(r, project, begin, end, r.pieces[begin / kGrain]); });
   join_pieces(r);
 }
 
@@ -72,19 +87,76 @@ TileJob tile_job(const Rendered& r, std::size_t tile) {
   return {r.splats.get(), r.lists.isects.get() + first, r.lists.offsets[tile + 1] - first, column * kTile, row * kTile, &r.camera, r.background};
 }
 
+// From what was projected to each tile's list.
+void list_tiles(Rendered& r, Pass pass, int threads) {
+  Stopwatch watch;
+  const Drawn* drawn = sort_by_key(r.order.get(), r.drawn, r.sorting, threads);  // near to far, equal depths in the caller's order
+  r.seconds.sort = watch.lap();
+  make_tile_lists(drawn, r.drawn, r.pairs, grid_of(r.camera), pass == Pass::kTrain, threads, PairLookup{r}, r.lists);
+  r.seconds.tiles = watch.lap();
+}
+
+template <class Draw>
+void each_tile(Rendered& r, int threads, const Draw& draw) {
+  Stopwatch watch;
+  parallel_for(grid_of(r.camera).count(), 1, threads, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t tile = begin; tile < end; ++tile) draw(tile_job(r, tile));
+  });
+  r.seconds.rasterize = watch.lap();
+}
+
+void begin_frame(Rendered& r, const Camera& camera, const float* background) {
+  r.camera = camera;
+  for (int c = 0; c < 3; ++c) r.background[c] = background ? background[c] : 0.0f;
+}
+
 }  // namespace
+
+std::size_t Rendered::bytes() const {
+  std::size_t listed = 0;
+  for (const Piece& piece : pieces) listed += piece.tiles.capacity() * sizeof(std::uint32_t);
+  return radii.bytes() + splats.bytes() + runs.bytes() + order.bytes() + sorting.records.bytes() + sorting.places.bytes() + lists.offsets.bytes() +
+         lists.isects.bytes() + lists.slots.bytes() + lists.places.bytes() + pieces.capacity() * sizeof(Piece) + listed;
+}
 
 void render_fwd(const Camera& camera, const GaussiansView& gaussians, const float* background, Pass pass, int threads, const Image& image,
                 Rendered& r) {
-  r.camera = camera;
-  for (int c = 0; c < 3; ++c) r.background[c] = background ? background[c] : 0.0f;
-  project_all(r, gaussians, threads);
-  const Drawn* drawn = sort_by_key(r.order.get(), r.drawn, r.sorting, threads);  // near to far, equal depths in the caller's order
-  const Grid grid = grid_of(camera);
-  make_tile_lists(drawn, r.drawn, r.pairs, grid, pass == Pass::kTrain, threads, PairLookup{r}, r.lists);
-  parallel_for(grid.count(), 1, threads, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t tile = begin; tile < end; ++tile) kernels().rasterize_fwd(tile_job(r, tile), image);
+  Stopwatch watch;
+  begin_frame(r, camera, background);
+  project_all(r, gaussians.count, threads, [&](std::size_t begin, std::size_t end, TileBox* boxes) {
+    kernels().project_fwd(r.camera, gaussians, begin, end, r.splats.get(), r.radii.get(), boxes);
   });
+  r.seconds.project = watch.lap();
+  list_tiles(r, pass, threads);
+  each_tile(r, threads, [&](const TileJob& job) { kernels().rasterize_fwd(job, image); });
+}
+
+void Splatter::prepare(const View& view, int threads) {
+  Rendered& r = rendered_;
+  Stopwatch watch;
+  begin_frame(r, view.camera, view.background);
+  if (packed_.bound()) {
+    frames_.reserve(packed_.faces_count);
+    parallel_for(packed_.faces_count, kGrain, threads, [&](std::size_t begin, std::size_t end) {
+      kernels().triangle_frames(view.vertices, packed_.faces.get(), begin, end, frames_.get());
+    });
+  }
+  r.seconds.frames = watch.lap();
+  project_all(r, packed_.count, threads, [&](std::size_t begin, std::size_t end, TileBox* boxes) {
+    kernels().project_packed(r.camera, packed_, frames_.get(), begin, end, r.splats.get(), r.radii.get(), boxes);
+  });
+  r.seconds.project = watch.lap();
+  list_tiles(r, Pass::kPlay, threads);
+}
+
+void Splatter::draw(const View& view, int threads, const Image& image) {
+  prepare(view, threads);
+  each_tile(rendered_, threads, [&](const TileJob& job) { kernels().rasterize_fwd(job, image); });
+}
+
+void Splatter::draw(const View& view, int threads, const Image8& image) {
+  prepare(view, threads);
+  each_tile(rendered_, threads, [&](const TileJob& job) { kernels().rasterize_rgba8(job, image); });
 }
 
 void render_bwd(const Rendered& r, const GaussiansView& gaussians, const Image& image, const ImageGrad& v_image, int threads,
