@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cap4d.bundle.onnx_scan import stores_half
 from cap4d.camera import Camera
 from cap4d.drive.clip import Clip
 from cap4d.rig.grid import UvGrid
@@ -73,6 +74,17 @@ class Bundle:
     @property
     def rig_name(self) -> str:
         return self.subject.rig_name
+
+    @property
+    def tiers(self) -> tuple[str, ...]:
+        """The forms of the deformer that it can play, the most exact first: of `full` and `fp16` (float32
+        arithmetic on weights stored as float16) the one its network is, then `int8`, `linear`, `off`.
+        """
+        tiers = []
+        if self.deform_onnx is not None:
+            tiers.append("fp16" if stores_half(self.deform_onnx) else "full")
+        cheaper = {"int8": self.deform_int8, "linear": self.deform_linear}
+        return (*tiers, *(tier for tier, part in cheaper.items() if part is not None), "off")
 
     @property
     def n_expressions(self) -> int:

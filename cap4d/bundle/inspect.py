@@ -34,7 +34,7 @@ def _lines(path: Path, manifest: Manifest, bundle: Bundle) -> list[str]:
         f"gaussians: {counts['gaussians']}, spherical harmonics of degree {degree}",
         f"camera: {camera.width}x{camera.height}, focal length {camera.K[0, 0]:.1f} px",
         f"idle clip: {counts['idle_frames']} frames, {seconds:.1f} s at {manifest.idle_fps:g} fps",
-        f"deformers: {', '.join(_deformers(bundle, manifest)) or 'none'}",
+        f"deformers: {', '.join(_deformers(bundle, manifest))}",
         "entries:",
     ]
     lines += [
@@ -48,14 +48,8 @@ def _lines(path: Path, manifest: Manifest, bundle: Bundle) -> list[str]:
 
 def _deformers(bundle: Bundle, manifest: Manifest) -> list[str]:
     """The tiers that the file can play, each with its error where the file says it."""
-    parts = {
-        "full": bundle.deform_onnx,
-        "fp16": bundle.deform_onnx,
-        "int8": bundle.deform_int8,
-        "linear": bundle.deform_linear,
-    }
     lines = []
-    for tier in (tier for tier, part in parts.items() if part is not None):
+    for tier in bundle.tiers:
         rms, worst = manifest.tier_errors.get(tier, (0.0, 0.0))
         known = tier in manifest.tier_errors
         lines.append(f"{tier} ({rms:.3f} mm RMS, {worst:.2f} mm at most)" if known else tier)
