@@ -80,8 +80,8 @@ def first(t: dict[str, np.ndarray], offsets: np.ndarray) -> np.ndarray:
     x = t["down0.rows"][edge].swapaxes(0, 1) + t["down0.columns"][edge]
     masked = np.pad(np.where(t["mask"], offsets, F(0)), ((0, 0), (1, 1), (1, 1)))
     for ky in range(4):
-        for kx in range(4):
-            for axis in range(3):
+        for axis in range(3):
+            for kx in range(4):
                 tap = masked[axis, ky : ky + 2 * half : 2, kx : kx + 2 * half : 2]
                 x = x + tap[..., None] * t["down0.weight"][:, axis, ky, kx]
     return x

@@ -176,78 +176,164 @@ void requantize(const RequantizeJob& job) {
 
 // ---- The first layer ----------------------------------------------------------------------------------------------------------------
 
-constexpr int kFirstPixels = 4;  // at once
+constexpr int kFirstLines = 2 * kFirstBand + 2;
+#if defined(CAP4D_AVX512)
+constexpr int kFirstPixels = 8;  // at once
+#else
+constexpr int kFirstPixels = 4;
+#endif
 
-template <int kVectors>
-CAP4D_INLINE void first_tile(const FirstJob& job, const float* const* lines, const float* rows, const float* columns, int x, int c) {
-  const int half = job.size / 2;
-  FloatV sum[kFirstPixels][kVectors];
-  for (int p = 0; p < kFirstPixels; ++p) {
-    const int edge = x + p == 0 ? 0 : x + p == half - 1 ? 2 : 1;
-    for (int v = 0; v < kVectors; ++v) {
-      const int at = c + v * kLanes;
-      sum[p][v] = load(rows + static_cast<std::size_t>(edge) * half * job.channels + at) + load(columns + static_cast<std::size_t>(x + p) * job.channels + at);
+// What a band of output rows reads: [line][axis][x], masked, with a zero on every side.
+struct FirstLines {
+  float value[kFirstLines][3][kMaxUnetSize + 2];
+};
+
+void fill_lines(const FirstJob& job, FirstLines& lines) {
+  const int size = job.size;
+  const std::size_t plane = static_cast<std::size_t>(size) * size;
+  for (int r = 0; r < kFirstLines; ++r) {
+    const int y = 2 * job.row - 1 + r;
+    for (int axis = 0; axis < 3; ++axis) {
+      float* line = lines.value[r][axis];
+      line[0] = line[size + 1] = 0.0f;
+      if (y < 0 || y >= size) {
+        std::fill_n(line + 1, size, 0.0f);
+        continue;
+      }
+      const std::uint8_t* mask = job.mask + static_cast<std::size_t>(y) * size;
+      const float* offsets = job.offsets + axis * plane + static_cast<std::size_t>(y) * size;
+      for (int x = 0; x < size; ++x) line[1 + x] = mask[x] ? offsets[x] : 0.0f;
     }
   }
+}
+
+template <int kPixels, int kVectors>
+CAP4D_INLINE void first_tile(const FirstJob& job, const FirstLines& lines, int row, int x, int c) {
+  const int half = job.size / 2, y = job.row + row;
+  const std::size_t channels = job.channels;
+  const auto edge = [half](int at) { return at == 0 ? 0 : at == half - 1 ? 2 : 1; };
+  const auto table = [=](const float* values, int border, int at) { return values + (static_cast<std::size_t>(border) * half + at) * channels + c; };
+  FloatV sum[kPixels][kVectors];
+  for (int p = 0; p < kPixels; ++p)
+    for (int v = 0; v < kVectors; ++v)
+      sum[p][v] = load(table(job.rows, edge(x + p), y) + v * kLanes) + load(table(job.columns, edge(y), x + p) + v * kLanes);
   const float* weights = job.weights + c;
   for (int line = 0; line < 4; ++line)
-    for (int tap = 0; tap < 12; ++tap, weights += job.channels)
-      for (int v = 0; v < kVectors; ++v) {
-        const FloatV w = load(weights + v * kLanes);
-        for (int p = 0; p < kFirstPixels; ++p) sum[p][v] = sum[p][v] + w * lines[line][6 * (x + p) + tap];
+    for (int axis = 0; axis < 3; ++axis)
+      for (int column = 0; column < 4; ++column, weights += channels) {
+        const float* input = lines.value[2 * row + line][axis] + 2 * x + column;
+        FloatV w[kVectors];
+        for (int v = 0; v < kVectors; ++v) w[v] = load(weights + v * kLanes);
+        for (int p = 0; p < kPixels; ++p)
+          for (int v = 0; v < kVectors; ++v) sum[p][v] = sum[p][v] + w[v] * input[2 * p];
       }
   for (int v = 0; v < kVectors; ++v) {
     const int at = c + v * kLanes;
     const Quantum leaky = quantum(job.leaky, at), relu = quantum(job.relu, at);
-    for (int p = 0; p < kFirstPixels; ++p) {
-      const std::size_t pixel = static_cast<std::size_t>(job.row + 1) * (half + 2) + x + p + 1;
-      activate(sum[p][v], job.leaky, leaky, job.relu, relu, pixel * job.channels + at);
+    for (int p = 0; p < kPixels; ++p) {
+      const std::size_t pixel = static_cast<std::size_t>(y + 1) * (half + 2) + x + p + 1;
+      activate(sum[p][v], job.leaky, leaky, job.relu, relu, pixel * channels + at);
     }
   }
+}
+
+template <int kPixels>
+void first_band(const FirstJob& job, const FirstLines& lines) {
+  for (int row = 0; row < kFirstBand; ++row)
+    for (int x = 0; x < job.size / 2; x += kPixels) {
+      int c = 0;
+      for (; c + 2 * kLanes <= job.channels; c += 2 * kLanes) first_tile<kPixels, 2>(job, lines, row, x, c);
+      for (; c < job.channels; c += kLanes) first_tile<kPixels, 1>(job, lines, row, x, c);
+    }
 }
 
 void first(const FirstJob& job) {
-  const int size = job.size, half = size / 2;
-  const std::size_t plane = static_cast<std::size_t>(size) * size;
-  float line[4][3 * (kMaxUnetSize + 2)];  // masked, axes innermost, a zero on either side
-  const float* lines[4];
-  for (int r = 0; r < 4; ++r) {
-    lines[r] = line[r];
-    const int y = 2 * job.row - 1 + r;
-    std::fill_n(line[r], 3 * (size + 2), 0.0f);
-    if (y < 0 || y >= size) continue;
-    for (int x = 0; x < size; ++x) {
-      const std::size_t at = static_cast<std::size_t>(y) * size + x;
-      if (job.mask[at])
-        for (int axis = 0; axis < 3; ++axis) line[r][3 * (x + 1) + axis] = job.offsets[axis * plane + at];
-    }
-  }
-  const int edge = job.row == 0 ? 0 : job.row == half - 1 ? 2 : 1;
-  const float* rows = job.rows + static_cast<std::size_t>(job.row) * job.channels;
-  const float* columns = job.columns + static_cast<std::size_t>(edge) * half * job.channels;
-  for (int x = 0; x < half; x += kFirstPixels) {
-    int c = 0;
-    for (; c + 2 * kLanes <= job.channels; c += 2 * kLanes) first_tile<2>(job, lines, rows, columns, x, c);
-    for (; c < job.channels; c += kLanes) first_tile<1>(job, lines, rows, columns, x, c);
-  }
+  FirstLines lines;
+  fill_lines(job, lines);
+  if (job.size / 2 % kFirstPixels == 0)
+    first_band<kFirstPixels>(job, lines);
+  else
+    first_band<4>(job, lines);
 }
 
 // ---- The last layer -----------------------------------------------------------------------------------------------------------------
+//
+// Three outputs are too few to be lanes. The register's fours of lanes are outputs (one of them idle), the lanes of a four take every
+// fourth four of channels, and one loading of input bytes serves all parities that read them.
+
+constexpr int kParities = 4, kOutputs = 4, kGroups = 4;
+constexpr int kLastStep = kOutputs * kGroups * 4;  // bytes of weights for 16 channels of one parity
+#if defined(CAP4D_AVX512)
+constexpr int kLastPixels = 4;  // at once
+#else
+constexpr int kLastPixels = 2;
+#endif
+
+// Sixteen bytes to every four lanes.
+CAP4D_INLINE Inputs spread16(const std::uint8_t* p) {
+#if defined(CAP4D_AVX512)
+  const IntV all = reinterpret_cast<IntV>(_mm512_broadcast_i32x4(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p))));
+#elif defined(__AVX2__)
+  const IntV all = reinterpret_cast<IntV>(_mm256_broadcastsi128_si256(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p))));
+#else
+  const IntV all = load_int(p);
+#endif
+#if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
+  return all;
+#else
+  return {all & 0x00ff00ff, (all >> 8) & 0x00ff00ff};
+#endif
+}
+
+// What the input pixel kRow rows and kColumn columns from the upper left one adds to the outputs of each parity that it reaches.
+template <int kRow, int kColumn>
+CAP4D_INLINE const std::int8_t* last_neighbour(const LastJob& job, const std::uint8_t* pixel, const std::int8_t* weights, IntV sum[kLastPixels][kParities]) {
+  const std::uint8_t* input = pixel + (static_cast<std::size_t>(kRow) * (job.size / 2 + 2) + kColumn) * job.channels;
+  for (int k = 0; k < job.channels; k += 4 * kGroups) {
+    Inputs a[kLastPixels];
+    for (int p = 0; p < kLastPixels; ++p) a[p] = spread16(input + p * job.channels + k);
+    for (int parity = 0; parity < kParities; ++parity) {
+      const int row = kRow - parity / 2, column = kColumn - parity % 2;
+      if (row < 0 || row > 1 || column < 0 || column > 1) continue;
+      const Weights w = unpack(load_int(weights));
+      weights += kLastStep;
+      for (int p = 0; p < kLastPixels; ++p) sum[p][parity] = dot4(sum[p][parity], a[p], w);
+    }
+  }
+  return weights;
+}
+
+void last_tile(const LastJob& job, int x) {
+  std::int32_t sums[kLastPixels][kParities][kOutputs * kGroups];
+  for (int lane = 0; lane < 3 * kGroups; lane += kLanes) {
+    IntV sum[kLastPixels][kParities] = {};
+    const std::int8_t* weights = job.weights + 4 * lane;
+    for (int source = 0; source < 2; ++source) {
+      const std::uint8_t* pixel = job.input + source * job.plane + (static_cast<std::size_t>(job.row) * (job.size / 2 + 2) + x) * job.channels;
+      weights = last_neighbour<0, 0>(job, pixel, weights, sum);
+      weights = last_neighbour<0, 1>(job, pixel, weights, sum);
+      weights = last_neighbour<0, 2>(job, pixel, weights, sum);
+      weights = last_neighbour<1, 0>(job, pixel, weights, sum);
+      weights = last_neighbour<1, 1>(job, pixel, weights, sum);
+      weights = last_neighbour<1, 2>(job, pixel, weights, sum);
+      weights = last_neighbour<2, 0>(job, pixel, weights, sum);
+      weights = last_neighbour<2, 1>(job, pixel, weights, sum);
+      weights = last_neighbour<2, 2>(job, pixel, weights, sum);
+    }
+    for (int p = 0; p < kLastPixels; ++p)
+      for (int parity = 0; parity < kParities; ++parity) store_int(sums[p][parity] + lane, sum[p][parity]);
+  }
+  for (int axis = 0; axis < 3; ++axis)
+    for (int p = 0; p < kLastPixels; ++p)
+      for (int parity = 0; parity < kParities; ++parity) {
+        const std::int32_t* four = sums[p][parity] + axis * kGroups;
+        const std::size_t y = 2 * job.row + parity / 2, column = 2 * (x + p) + parity % 2;
+        job.out[(axis * job.size + y) * job.size + column] = static_cast<float>((four[0] + four[1]) + (four[2] + four[3])) * job.scale[axis] + job.bias[axis];
+      }
+}
 
 void last(const LastJob& job) {
-  std::int32_t acc[kMaxUnetSize / 2 * kChannelBlock];
-  DotJob dots = job.dot;
-  dots.acc = acc;
-  dot(dots);
-  const std::size_t plane = static_cast<std::size_t>(job.size) * job.size;
-  for (int axis = 0; axis < 3; ++axis)
-    for (int down = 0; down < 2; ++down) {
-      float* out = job.out + axis * plane + static_cast<std::size_t>(2 * job.row + down) * job.size;
-      const std::int32_t* from = acc + 6 * down + axis;
-      for (std::size_t x = 0; x < dots.count; ++x)
-        for (int right = 0; right < 2; ++right)
-          out[2 * x + right] = static_cast<float>(from[x * kChannelBlock + 3 * right]) * job.scale[axis] + job.bias[axis];
-    }
+  for (int x = 0; x < job.size / 2; x += kLastPixels) last_tile(job, x);
 }
 
 #define CAP4D_TEXT(name) CAP4D_TEXT_(name)

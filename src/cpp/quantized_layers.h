@@ -13,6 +13,7 @@ inline constexpr int kChannelBlock = 16;
 inline constexpr int kMaxPanel = 32;
 inline constexpr int kMaxUnetSize = 512;  // px a side
 inline constexpr int kFirstTaps = 4 * 4 * 3;
+inline constexpr int kFirstBand = 4;  // rows that are computed at once
 inline constexpr float kLeak = 0.2f;  // of LeakyReLU (fact 22)
 
 // A run of bytes that enters the dot product of a pixel, relative to the pixel's first byte.
@@ -58,23 +59,25 @@ struct RequantizeJob {
   Requantizer leaky, relu;
 };
 
-// The first layer, in float: row `row` of its output. Offsets are masked; what constant inputs and biases add is in two tables that
-// hold the first, the inner and the last column (of `rows`) or row (of `columns`).
+// The first layer, in float: rows [row, row + kFirstBand) of its output. Offsets are masked; what constant inputs and biases add is in
+// two tables that hold the first, an inner and the last column (of `rows`) or row (of `columns`).
 struct FirstJob {
-  const float* offsets;      // [3, size, size]
-  const std::uint8_t* mask;  // [size, size]
-  int size, channels, row;   // channels: padded
-  const float* weights;      // [kFirstTaps][channels], taps row, column, axis
+  const float* offsets;         // [3, size, size]
+  const std::uint8_t* mask;     // [size, size]
+  int size, channels, row;      // channels: padded
+  const float* weights;         // [kFirstTaps][channels], taps row, axis, column
   const float *rows, *columns;  // [3][size / 2][channels]
   Requantizer leaky, relu;
 };
 
-// The last layer: rows 2 row and 2 row + 1 of the answer. One panel of 16 holds 4 parities x 3 axes.
+// The last layer: rows 2 row and 2 row + 1 of the answer, from the two images of `input`.
 struct LastJob {
-  DotJob dot;  // of one row of input pixels; acc is not used
-  int size, row;
-  const float *scale, *bias;  // [3]
-  float* out;                 // [3, size, size]
+  const std::uint8_t* input;
+  std::size_t plane;           // bytes from one image to the other
+  int size, channels, row;     // channels: padded
+  const std::int8_t* weights;  // [2 images][3 x 3 input pixels][channels / 16][parities that read the pixel][4 outputs][16]
+  const float *scale, *bias;   // [3]
+  float* out;                  // [3, size, size]
 };
 
 struct UnetKernels {

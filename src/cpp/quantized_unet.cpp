@@ -174,7 +174,7 @@ void check(const UnetTensors& t) {
   }
 }
 
-// The work of one layer in a frame: items are handed out one by one, and the next layer starts when all are done.
+// The work of one layer in a frame, on cache lines of its own: items are handed out one by one, and the next layer starts when all are done.
 struct alignas(64) Phase {
   int items = 0;
   std::atomic<int> next{0}, done{0};
@@ -198,11 +198,12 @@ struct QuantizedUnet::Impl {
   Destination first_leaky, first_relu;
   std::vector<Image8> leaky;    // [depth - 1] outputs of the way down, for the next layer
   std::vector<Image8> decoder;  // [depth] input of up i: the way down's output, then that of up i + 1
-  std::vector<Layer> layers;    // down 1, .., up depth - 1, .., up 1, up 0
+  std::vector<Layer> layers;    // down 1, .., up depth - 1, .., up 1
+  Aligned<std::int8_t> last_weights;
   float last_scale[3], last_bias[3];
 
   std::mutex busy;
-  std::unique_ptr<Phase[]> phases;  // down 0, then one per layer
+  mutable std::vector<Phase> phases;        // down 0, one per layer, up 0
   std::vector<Aligned<std::int32_t>> sums;  // of each thread
   std::size_t most_sums = 0;
   const float* offsets = nullptr;
@@ -216,10 +217,12 @@ struct QuantizedUnet::Impl {
     }
     load_first(t);
     for (int i = 1; i < depth; ++i) load_down(t, i);
-    for (int i = depth - 1; i >= 0; --i) load_up(t, i);
-    phases = std::make_unique<Phase[]>(layers.size() + 1);
-    phases[0].items = size / 2;
-    for (std::size_t i = 0; i < layers.size(); ++i) phases[i + 1].items = i + 1 < layers.size() ? layers[i].panels() : size / 2;
+    for (int i = depth - 1; i > 0; --i) load_up(t, i);
+    load_last(t);
+    phases = std::vector<Phase>(layers.size() + 2);
+    phases.front().items = size / 2 / kFirstBand;
+    for (std::size_t i = 0; i < layers.size(); ++i) phases[i + 1].items = layers[i].panels();
+    phases.back().items = size / 2;
     for (const Layer& layer : layers) most_sums = std::max(most_sums, layer.to.size() * layer.panel);
   }
 
@@ -228,7 +231,8 @@ struct QuantizedUnet::Impl {
     first_weights = Aligned<float>(static_cast<std::size_t>(kFirstTaps) * channels);
     for (int c = 0; c < width; ++c)
       for (int axis = 0; axis < 3; ++axis)
-        for (int tap = 0; tap < 16; ++tap) first_weights[static_cast<std::size_t>(3 * tap + axis) * channels + c] = t.weight[(c * 3 + axis) * 16 + tap];
+        for (int tap = 0; tap < 16; ++tap)
+          first_weights[static_cast<std::size_t>(12 * (tap / 4) + 4 * axis + tap % 4) * channels + c] = t.weight[(c * 3 + axis) * 16 + tap];
     const auto table = [&](std::span<const float> values) {
       Aligned<float> out(static_cast<std::size_t>(3) * half * channels);
       for (int i = 0; i < 3 * half; ++i) std::copy_n(values.data() + static_cast<std::size_t>(i) * width, width, out.data() + static_cast<std::size_t>(i) * channels);
@@ -262,39 +266,50 @@ struct QuantizedUnet::Impl {
   }
 
   // A 4 x 4 transposed convolution of stride 2 is four 2 x 2 convolutions, one for each parity of the output's row and column.
-  // Up 0 has so few outputs that it is one 3 x 3 convolution with the outputs of all parities side by side, of weights partly zero.
+  // Input pixel y + below - 1 + line reaches output 2 y + below by row 3 - below - 2 line of the kernel; columns alike.
   void load_up(const UnetTensors& t, int i) {
     const UpTensors& up = t.up[i];
-    const Image8& image = decoder[i];
-    const int side = image.side, channels = unet_channels(width, i), outputs = i ? unet_channels(width, i - 1) : 3;
-    const int sources = i == depth - 1 ? 1 : 2, reach = i ? 2 : 3, parities = i ? 4 : 1;
-    Layer& layer = add_layer(image, i ? outputs : 4 * outputs, i ? up.scale : std::span<const float>(), {});
+    const Image8 &image = decoder[i], &next = decoder[i - 1];
+    const int side = image.side, channels = unet_channels(width, i), outputs = unet_channels(width, i - 1);
+    const int sources = i == depth - 1 ? 1 : 2;
+    Layer& layer = add_layer(image, outputs, up.scale, {});
     for (int y = 0; y < side; ++y)
       for (int x = 0; x < side; ++x) layer.from.push_back(image.outer(y, x));
-    layer.segments.resize(parities);
-    for (int parity = 0; parity < parities; ++parity) {
+    layer.segments.resize(4);
+    for (int parity = 0; parity < 4; ++parity) {
       const int below = parity / 2, right = parity % 2;
       for (int source = 0; source < sources; ++source)
-        for (int line = 0; line < reach; ++line)
-          layer.segments[parity].push_back({static_cast<std::uint32_t>(source * image.plane()) + image.outer(below + line, right), static_cast<std::uint32_t>(reach * image.channels)});
-      if (i == 0) continue;
+        for (int line = 0; line < 2; ++line)
+          layer.segments[parity].push_back({static_cast<std::uint32_t>(source * image.plane()) + image.outer(below + line, right), static_cast<std::uint32_t>(2 * image.channels)});
       for (int y = 0; y < side; ++y)
-        for (int x = 0; x < side; ++x) layer.to.push_back(decoder[i - 1].inner(2 * y + below, 2 * x + right));
+        for (int x = 0; x < side; ++x) layer.to.push_back(next.inner(2 * y + below, 2 * x + right));
     }
-    layer.taps = static_cast<std::size_t>(sources) * reach * reach * image.channels;
+    layer.taps = static_cast<std::size_t>(sources) * 4 * image.channels;
     pack(layer, [&](int parity, int output, int segment, int column, int channel) -> std::int8_t {
-      const int source = segment / reach, line = segment % reach;
-      if (i == 0) parity = output / outputs, output = output % outputs;
-      if (parity > 3 || output >= outputs || channel >= channels) return 0;
-      // Input pixel y + below - 1 + line of a 2 x 2 convolution (y - 1 + line of the 3 x 3 one) reaches output 2 y + below by this tap.
-      const int ky = i ? 3 - parity / 2 - 2 * line : 3 + parity / 2 - 2 * line, kx = i ? 3 - parity % 2 - 2 * column : 3 + parity % 2 - 2 * column;
-      if (ky < 0 || ky > 3 || kx < 0 || kx > 3) return 0;
-      return up.weight[(static_cast<std::size_t>(source * channels + channel) * outputs + output) * 16 + 4 * ky + kx];
+      if (output >= outputs || channel >= channels) return 0;
+      const int ky = 3 - parity / 2 - 2 * (segment % 2), kx = 3 - parity % 2 - 2 * column;
+      return up.weight[(static_cast<std::size_t>(segment / 2 * channels + channel) * outputs + output) * 16 + 4 * ky + kx];
     }, std::vector<std::uint8_t>(image.channels));
-    if (i > 0)
-      layer.relu = destination(decoder[i - 1].bytes.data() + decoder[i - 1].plane(), up.relu_scale, {}, layer.outputs);
-    else
-      std::copy_n(up.scale.data(), 3, last_scale), std::copy_n(up.bias.data(), 3, last_bias);
+    layer.relu = destination(next.bytes.data() + next.plane(), up.relu_scale, {}, layer.outputs);
+  }
+
+  void load_last(const UnetTensors& t) {
+    const UpTensors& up = t.up[0];
+    const int channels = decoder[0].channels;
+    last_weights = Aligned<std::int8_t>(static_cast<std::size_t>(2) * 16 * channels * 4);
+    std::int8_t* to = last_weights.data();
+    for (int source = 0; source < 2; ++source)
+      for (int pixel = 0; pixel < 9; ++pixel)
+        for (int first = 0; first < channels; first += kChannelBlock)
+          for (int parity = 0; parity < 4; ++parity) {
+            const int line = pixel / 3 - parity / 2, column = pixel % 3 - parity % 2;
+            if (line < 0 || line > 1 || column < 0 || column > 1) continue;
+            const int tap = 4 * (3 - parity / 2 - 2 * line) + 3 - parity % 2 - 2 * column;
+            for (int output = 0; output < 4; ++output)
+              for (int c = first; c < first + kChannelBlock; ++c)
+                *to++ = output < 3 && c < width ? up.weight[(static_cast<std::size_t>(source * width + c) * 3 + output) * 16 + tap] : 0;
+          }
+    std::copy_n(up.scale.data(), 3, last_scale), std::copy_n(up.bias.data(), 3, last_bias);
   }
 
   // A bias makes a layer one that is not normalised.
@@ -322,25 +337,23 @@ struct QuantizedUnet::Impl {
     }
     float *mean = layer.mean.data() + channel, *gain = layer.gain.data() + channel;
     if (layer.normalised) kernels.norm({acc, outputs, panel, layer.epsilon.data() + channel, mean, gain});
-    kernels.requantize({acc, layer.to.data(), outputs, panel, mean, gain, layer.leaky.from(channel), layer.relu.from(channel)});
+    // Two neighbouring panels may share cache lines: they start at different ends, so that two threads do not fight for each line.
+    const std::size_t half = outputs / 2;
+    for (const std::size_t begin : {index % 2 ? half : 0, index % 2 ? 0 : half})
+      kernels.requantize({acc + begin * panel, layer.to.data() + begin, half, panel, mean, gain, layer.leaky.from(channel), layer.relu.from(channel)});
   }
 
   void run_item(std::size_t phase, int item, std::int32_t* acc) const {
-    if (phase == 0) {
-      kernels.first({offsets, mask.data(), size, padded(width), item, first_weights.data(), rows.data(), columns.data(), first_leaky.from(0), first_relu.from(0)});
-    } else if (phase < layers.size()) {
+    if (phase == 0)
+      kernels.first({offsets, mask.data(), size, padded(width), item * kFirstBand, first_weights.data(), rows.data(), columns.data(), first_leaky.from(0), first_relu.from(0)});
+    else if (phase <= layers.size())
       run_panel(layers[phase - 1], item, acc);
-    } else {
-      const Layer& layer = layers.back();
-      const std::size_t half = size / 2;
-      const auto& segments = layer.segments[0];
-      kernels.last({{layer.input, layer.from.data() + item * half, half, segments.data(), static_cast<int>(segments.size()), layer.weights.data(), layer.init.data(),
-                     kChannelBlock, nullptr}, size, item, last_scale, last_bias, out});
-    }
+    else
+      kernels.last({decoder[0].bytes.data(), decoder[0].plane(), size, padded(width), item, last_weights.data(), last_scale, last_bias, out});
   }
 
   void take_part(std::int32_t* acc) const {
-    for (std::size_t i = 0; i <= layers.size(); ++i) {
+    for (std::size_t i = 0; i < phases.size(); ++i) {
       Phase& phase = phases[i];
       for (int item; (item = phase.next.fetch_add(1, std::memory_order_relaxed)) < phase.items;) {
         run_item(i, item, acc);
@@ -366,7 +379,7 @@ void QuantizedUnet::run(const float* offsets, int threads, float* out) {
   std::lock_guard lock(net.busy);
   threads = std::clamp(threads <= 0 ? default_threads() : threads, 1, net.size / 2);
   while (net.sums.size() < static_cast<std::size_t>(threads)) net.sums.emplace_back(net.most_sums);
-  for (std::size_t i = 0; i <= net.layers.size(); ++i) net.phases[i].next = 0, net.phases[i].done = 0;
+  for (Phase& phase : net.phases) phase.next = 0, phase.done = 0;
   net.offsets = offsets, net.out = out;
   parallel_for(threads, 1, threads, [&net](std::size_t begin, std::size_t) { net.take_part(net.sums[begin].data()); });
 }
