@@ -17,6 +17,7 @@ pytest.importorskip("onnx")
 
 import onnx
 from bundle_forge import Forge
+from quantized_reference import random_network
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import Bundle, read_bundle, write_bundle
@@ -411,7 +412,7 @@ def compact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bundle = replace(
         bundle,
         subject=replace(bundle.subject, expression_basis=basis),
-        deform_int8={"weight": np.ones(4, np.int8)},
+        deform_int8=random_network(SIZE, 1),
         deform_linear=linear,
         tier_errors={"int8": (0.1, 0.2)},
     )
@@ -489,8 +490,8 @@ COMPACT_ABUSE = {
     "masked_points_of_two": (remade(RIG, BASIS, lambda v: v[:, :2]), BASIS),
     "linear_where_nothing_deforms": (
         remade(GRID, "deformable", lambda v: v * (np.arange(len(v)) < 50)), "deform_linear"),
-    "int8_network_of_int64": (remade(INT8, "weight", np.int64), "weight"),
-    "int8_network_without_tensors": ((INT8, lambda t: t.clear()), "tensors"),
+    "int8_network_of_floats": (remade(INT8, "down1.weight", np.float32), "down1.weight"),
+    "int8_network_without_tensors": ((INT8, lambda t: t.clear()), "down0.weight"),
 }  # fmt: skip
 
 

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from quantized_reference import random_network
 from tiny_bundle import tiny_bundle, tiny_mesh
 
 from cap4d.bundle import Bundle, describe, read_bundle, read_manifest, schema, write_bundle
@@ -34,11 +35,11 @@ def bundle() -> Bundle:
 
 
 def bundle_of_tiers(*, network: bool = True) -> Bundle:
-    """A bundle with all that version 2 brought; its whole-number network is of the right form only."""
+    """A bundle with all that version 2 brought."""
     bundle = tiny_bundle(network=network, mesh=False)
     linear = 1e-3 * np.random.default_rng(2).normal(size=bundle.subject.expression_basis.shape)
     linear[:, ~bundle.grid.deformable] = 0
-    quantized = {"weight": np.arange(-4, 4, dtype=np.int8).reshape(2, 4), "scale": np.ones(2, np.float32)}
+    quantized = random_network(bundle.grid.size, 1)
     errors = {"int8": (0.01, 0.2), "linear": (0.1, 1.5)}
     return replace(bundle, deform_int8=quantized, deform_linear=linear.astype(np.float32), tier_errors=errors)
 
