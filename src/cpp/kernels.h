@@ -59,7 +59,7 @@ struct Kernels {
   void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t* slots, SplatGrad* grads);
 };
 
-// The widest variant this processor runs; CAP4D_ISA=base|v3|v4 in the environment asks for a narrower one.
+// The widest variant this processor runs; CAP4D_ISA=base|v3|v4|vnni in the environment asks for a narrower one.
 // Throws std::invalid_argument on any other value.
 const Kernels& kernels();
 
