@@ -1,6 +1,7 @@
 """The C++ extension. Arrays must have the dtype named here and be C-contiguous: nothing is converted."""
 
-from typing import Literal, final
+from collections.abc import Mapping
+from typing import ClassVar, Literal, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,24 @@ def rasterize_vjp(
     threads: int = 0,
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
     """Gradients of means, quats, scales, opacities, sh and means2d."""
+
+@final
+class QuantizedUnet:
+    """The deformation network in 8-bit integers (`bundle.quantized_unet` has the tensors' meaning).
+
+    The same bits for any thread count and on every instruction set. Calls from several threads wait for each
+    other.
+    """
+
+    isa: ClassVar[Literal["base", "v3", "v4", "vnni"]]
+    """The variant of the inner loops in use."""
+
+    def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:
+        """For a grid of `size` px. ValueError: a tensor is missing, or of a wrong dtype or shape."""
+    @property
+    def size(self) -> int: ...
+    def run(self, offsets: _F32, threads: int = 0) -> _F32:
+        """offsets [3, S, S] m -> deformation [3, S, S] m. ValueError: a number is not finite."""
 
 def isa() -> Literal["base", "v3", "v4"]:
     """The x86-64 level of the inner loops in use (CAP4D_ISA asks for a lower one)."""

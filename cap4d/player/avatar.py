@@ -10,16 +10,15 @@ import numpy as np
 from cap4d.bind import bind_fast
 from cap4d.bundle.bundle import Bundle
 from cap4d.bundle.reader import read_bundle
-from cap4d.bundle.schema import ONNX
 from cap4d.camera import Camera, opencv_from_rig
 from cap4d.drive.clip import Clip, Frame
 from cap4d.errors import ArgumentError
 from cap4d.gaussians import Gaussians
-from cap4d.player.deformer import Deformer
 from cap4d.player.stages import Stages
+from cap4d.player.tiers import BUDGET_MS, choose_tier, moving_subject
 from cap4d.render import render
 
-DEFORMERS = ("auto", "full", "off")
+Tier = Literal["auto", "full", "fp16", "int8", "linear", "off"]
 
 
 class Avatar:
@@ -27,43 +26,59 @@ class Avatar:
 
     Args:
         bundle: The avatar.
-        deformer: `full` (what `auto` means) runs the network; `off` leaves its neutral correction only.
+        deformer: How the network is evaluated: `full`, `fp16` or `int8` run it, `linear` adds what was
+            learned of it to the expressions, `off` leaves its neutral correction only. `auto`: the most exact
+            that keeps up on this machine (`tiers.choose_tier`).
         threads: For the network and the renderer; 0: see `deformer.default_threads`.
         source: The file it came from, for error messages.
+        deformer_budget_ms: What a pass may take for `auto`; infinity is the most exact, unmeasured.
+    Raises:
+        ArgumentError: The bundle does not have that deformer.
+        DataError: Its network does not load.
     """
 
     def __init__(
         self,
         bundle: Bundle,
         *,
-        deformer: Literal["auto", "full", "off"] = "auto",
+        deformer: Tier = "auto",
         threads: int = 0,
         source: str = "avatar",
+        deformer_budget_ms: float = BUDGET_MS,
     ) -> None:
-        if deformer not in DEFORMERS:
-            raise ArgumentError(f"deformer: expected one of {', '.join(DEFORMERS)}, got {deformer}")
         self.bundle, self.threads = bundle, threads
         self.stages = Stages()
-        self.deformer: Deformer | None = None
-        if bundle.deform_onnx is not None and deformer != "off":
-            name = f"{source}:{ONNX}"
-            self.deformer = Deformer(bundle.deform_onnx, size=bundle.grid.size, source=name, threads=threads)
+        self.tier, self.deformer = choose_tier(
+            bundle, deformer, threads=threads, source=source, budget_ms=deformer_budget_ms
+        )
         # Mixing leaves strided arrays, which every product would copy: 45 ms a frame instead of 1 at E = 65.
-        self._subject = bundle.subject.map(np.ascontiguousarray)
+        self._subject = moving_subject(bundle, self.tier).map(np.ascontiguousarray)
         self._neutral = self._subject.pose(np.zeros(bundle.n_expressions, np.float32))
         self._deformable = bundle.grid.deformable[:, None]
         self._opacities = _sigmoid(bundle.opacity_logits)
 
     @classmethod
     def load(
-        cls, path: str | Path, *, deformer: Literal["auto", "full", "off"] = "auto", threads: int = 0
+        cls,
+        path: str | Path,
+        *,
+        deformer: Tier = "auto",
+        threads: int = 0,
+        deformer_budget_ms: float = BUDGET_MS,
     ) -> Avatar:
         """Reads a `.cap4d` file.
 
         Raises:
+            ArgumentError: It does not have that deformer.
             DataError: It is not sound; see `cap4d.bundle.read_bundle`.
         """
-        return cls(read_bundle(path), deformer=deformer, threads=threads, source=str(path))
+        return cls(
+            read_bundle(path),
+            deformer=deformer,
+            threads=threads,
+            source=str(path),
+            deformer_budget_ms=deformer_budget_ms,
+        )
 
     @property
     def camera(self) -> Camera:

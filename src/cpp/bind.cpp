@@ -6,7 +6,7 @@
 
 #include "constants.h"
 #include "parallel.h"
-#include "tiles.h"
+#include "scratch.h"
 
 namespace cap4d {
 namespace {
@@ -87,6 +87,15 @@ void bind(const float* vertices, const BoundGaussians& bound, int threads, float
       bind_one(frames[bound.binding[i]], bound.means + 3 * i, bound.quats + 4 * i, bound.log_scales + 3 * i, means + 3 * i, quats + 4 * i,
                scales + 3 * i);
   });
+}
+
+void upright(const float* axes, float* rotmat) {
+  float q[4];
+  rotmat_to_quat(axes, q);
+  const float w = q[0], x = q[1], y = q[2], z = q[3];
+  const float r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+                      2 * (y * z - w * x),     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
+  std::copy_n(r, 9, rotmat);
 }
 
 // backward ------------------------------------------------------------------------------------------------------------------

@@ -17,6 +17,10 @@ struct BoundGaussians {
 // A triangle without area gets some rotation and its own (possibly zero) size; nothing becomes NaN that was not.
 void bind(const float* vertices, const BoundGaussians& bound, int threads, float* means, float* quats, float* scales);
 
+// The rotation that `bind` gives to what rides on a triangle whose axes are the columns of `axes` [9]: the same where they are a
+// rotation, and some rotation where the triangle has no area.
+void upright(const float* axes, float* rotmat);
+
 // The VJP of `bind`: from gradients of its outputs to those of vertices [G, 3], means, quats and log_scales, all overwritten.
 // A triangle without area passes on what moves its centre and nothing else.
 struct BindGradients {
