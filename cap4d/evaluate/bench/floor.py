@@ -94,12 +94,11 @@ def total_ms(stages: list[Stage]) -> float:
 
 
 def floors_ms(work: Work, ceilings: Ceilings, *, lanes: int) -> dict[str, float]:
-    """Floors of `forward` and of `forward_backward`."""
+    """Floors of `forward` (prepared Gaussians, SH in float16), `stateless` and `forward_backward`."""
+    play = total_ms(forward_floor(work, ceilings, lanes=lanes, half_sh=True))
     forward = total_ms(forward_floor(work, ceilings, lanes=lanes))
-    return {
-        "forward": forward,
-        "forward_backward": forward + total_ms(backward_floor(work, ceilings, lanes=lanes)),
-    }
+    backward = total_ms(backward_floor(work, ceilings, lanes=lanes))
+    return {"forward": play, "stateless": forward, "forward_backward": forward + backward}
 
 
 def scaled_target_ms(

@@ -22,7 +22,7 @@ import numpy as np
 from cap4d.evaluate.bench.accuracy import picture_error
 from cap4d.evaluate.bench.scenes import Scene, SceneSource
 from cap4d.evaluate.bench.settings import Settings
-from cap4d.evaluate.bench.splatting import both_passes
+from cap4d.evaluate.bench.splatting import forward, forward_backward
 from cap4d.evaluate.bench.tiled import (
     EPS2D,
     TRANSMITTANCE_MIN,
@@ -81,7 +81,8 @@ def find_peers(scene: Scene, settings: Settings) -> tuple[dict[str, Peer], list[
 
 
 def _compare(scene: Scene, truth: Picture, peers: dict[str, Peer], settings: Settings) -> dict[str, Any]:
-    ours = both_passes(scene, threads=settings.threads)
+    makers = {"forward": forward, "forward_backward": forward_backward}
+    ours = {kind: make(scene, threads=settings.threads) for kind, make in makers.items()}
     calls = {("ours", kind): call for kind, call in ours.items()}
     for name, peer in peers.items():
         calls[name, "forward"] = peer.forward

@@ -126,23 +126,26 @@ def draw_roofline(figure: Any, report: Report) -> None:
         )
         axes.plot(intensity, floor, "D", color=colour, markersize=7, fillstyle="none",
                   label=f"{text}: floor, {entry['floor_ms']:.2f} ms")  # fmt: skip
-    for stage in splat["roofline"][-1]["stages"]:
+    for stage in splat["roofline"][0]["measured"]:
         if stage["flops"]:
-            at = (stage["flops"] / stage["bytes"], stage["flops"] / stage["ms"] * 1e-6)
-            axes.plot(*at, "s", color=INK, markersize=4)
-            axes.annotate(
-                f"{stage['name']} {stage['ms']:.2f} ms",
-                at,
-                xytext=(6, -10),
-                textcoords="offset points",
-                fontsize=8,
-            )
+            _draw_stage(axes, stage)
     plain_ticks(axes.xaxis, [0.5, 1, 2, 5, 10, 20, 50, 100, 200])
     plain_ticks(axes.yaxis, [5, 10, 20, 50, 100, 200, 500])
     axes.set_ylim(5, 2 * roofs["gflops"])
     axes.legend(
-        frameon=False, fontsize=9, loc="lower right", title="squares: stages at their floor", title_fontsize=9
+        frameon=False, fontsize=9, loc="lower right", title="squares: stages of forward", title_fontsize=9
     )
+
+
+def _draw_stage(axes: Any, stage: Report) -> None:
+    """Measured, and at its floor."""
+    intensity = stage["flops"] / stage["bytes"]
+    heights = [stage["flops"] / stage[key] * 1e-6 for key in ("ms", "floor_ms")]
+    axes.plot([intensity] * 2, heights, color=INK, linewidth=0.8)
+    axes.plot(intensity, heights[0], "s", color=INK, markersize=7)
+    axes.plot(intensity, heights[1], "s", color=INK, markersize=6, fillstyle="none")
+    text = f"{stage['name']}: {stage['ms']:.2f} ms, floor {stage['floor_ms']:.2f}"
+    axes.annotate(text, (intensity, heights[0]), xytext=(8, -4), textcoords="offset points", fontsize=9)
 
 
 def draw_peers(figure: Any, report: Report) -> None:

@@ -52,6 +52,10 @@ def splatting_shows(splat: dict[str, Any], ceilings: Ceilings, *, lanes: int) ->
     targets = {"forward": FORWARD_MS, "forward_backward": FORWARD_BACKWARD_MS}
     for name, target in targets.items():
         yield _speed(main, name, target, work, ceilings, lanes=lanes, threads=threads)
+    alone = main["stateless"]["median_ms"]
+    yield Show(1, f"{MAIN} forward of float32 Gaussians, nothing prepared: {alone:.2f} ms", None)
+    between = [f"{s['name']} {s['ms']:.2f} of {s['floor_ms']:.2f}" for s in splat["roofline"][0]["measured"]]
+    yield Show(1, f"between the floor and forward, ms: {', '.join(between)}", None)
     error = main["error"]
     yield Show(
         1,

@@ -14,10 +14,11 @@ from cap4d import _core
 from cap4d.evaluate.bench.accuracy import picture_error
 from cap4d.evaluate.bench.ceilings import Ceilings
 from cap4d.evaluate.bench.child import ChildError, in_child
-from cap4d.evaluate.bench.floor import backward_floor, floors_ms, forward_floor
+from cap4d.evaluate.bench.floor import Stage, backward_floor, floors_ms, forward_floor, total_ms
 from cap4d.evaluate.bench.memory import memory_of
 from cap4d.evaluate.bench.scenes import NAMES, Scene, SceneSource
 from cap4d.evaluate.bench.settings import Settings
+from cap4d.evaluate.bench.tiled import Picture
 from cap4d.evaluate.bench.timing import measure
 from cap4d.evaluate.bench.work import Work, count_work
 
@@ -27,7 +28,9 @@ LANES = {"base": 4, "v3": 8, "v4": 16}
 MAIN = "head_100k"  # what the scaling is measured on
 SIDES = (256, 384, 512, 768, 1024)  # px
 TABLE = ("head_30k", "head_100k", "head_300k", "bad_100k")
-PASSES = ("forward", "forward_backward")
+PASSES = ("forward", "stateless", "forward_backward")
+STAGES = {"project": ("project",), "sort": ("sort",), "tiles": ("bin",), "rasterize": ("blend", "write")}
+"""Stages that the splatter times -> those of the floor that they do."""
 
 
 def lanes() -> int:
@@ -35,8 +38,32 @@ def lanes() -> int:
     return LANES[_core.isa()]
 
 
-def forward(scene: Scene, *, threads: int) -> Callable[[], Any]:
-    """Drawing for the eye: nothing is kept for a gradient."""
+class Playing:
+    """Drawing for the eye as a player does: Gaussians prepared once (colours in float16), buffers kept.
+
+    Calling it draws; `seconds` collects what each stage of each call took.
+    """
+
+    def __init__(self, scene: Scene, *, threads: int) -> None:
+        self._splatter = _core.Splatter(*scene.fields)
+        self._view, self._threads = scene.view, threads
+        self.seconds: list[dict[str, float]] = []
+
+    def __call__(self) -> tuple[np.ndarray, ...]:
+        image = self._splatter.render(*self._view, threads=self._threads)
+        self.seconds.append(self._splatter.seconds)
+        return image
+
+    def stage_ms(self) -> dict[str, float]:
+        """Median milliseconds of each stage."""
+        return {
+            stage: round(1e3 * float(np.median([seconds[stage] for seconds in self.seconds])), 4)
+            for stage in STAGES
+        }
+
+
+def stateless(scene: Scene, *, threads: int) -> Callable[[], Any]:
+    """Drawing Gaussians that may be others each time, in single precision."""
     return lambda: _core.render(*scene.fields, *scene.view, None, -1, threads)
 
 
@@ -54,11 +81,10 @@ def forward_backward(scene: Scene, *, threads: int) -> Callable[[], Any]:
     return step
 
 
-def both_passes(scene: Scene, *, threads: int) -> dict[str, Callable[[], Any]]:
-    return {
-        "forward": forward(scene, threads=threads),
-        "forward_backward": forward_backward(scene, threads=threads),
-    }
+def passes(scene: Scene, *, threads: int) -> dict[str, Callable[[], Any]]:
+    """Ready to be timed, by the names of `PASSES`."""
+    makers = (Playing, stateless, forward_backward)
+    return {name: make(scene, threads=threads) for name, make in zip(PASSES, makers, strict=True)}
 
 
 def measure_splatting(
@@ -79,7 +105,7 @@ def measure_splatting(
             "name": name,
             "work": work.report(),
             **times[name],
-            "error": picture_error(forward(scenes[name], threads=settings.threads)()[0], picture.rgb),
+            "error": _errors(scenes[name], picture, settings),
             "memory_mb": _alone(source, name, settings).get("memory_mb"),
             **_against_floor(times[name], work, ceilings[settings.threads]),
         }
@@ -96,28 +122,39 @@ def measure_splatting(
             "sh_degree": _over_sh_degrees(main, settings),
             "isa": _over_instruction_sets(source, settings),
         },
-        "roofline": roofline(work, ceilings[settings.threads], times[MAIN]),
+        "roofline": roofline(work, ceilings[settings.threads], times[MAIN], stage_times(main, settings)),
     }
 
 
-def roofline(work: Work, ceilings: Ceilings, times: dict[str, Any]) -> list[dict[str, Any]]:
-    """Operations, bytes and, where it was timed, milliseconds of each pass and stage."""
-    stages = {
-        "forward": forward_floor(work, ceilings, lanes=lanes()),
-        "forward_backward": forward_floor(work, ceilings, lanes=lanes())
-        + backward_floor(work, ceilings, lanes=lanes()),
-    }
-    return [
+def roofline(
+    work: Work, ceilings: Ceilings, times: dict[str, Any], measured: dict[str, float]
+) -> list[dict[str, Any]]:
+    """Operations, bytes, floor and milliseconds of `forward`, stage by stage, and of `forward_backward`.
+
+    Args:
+        measured: See `stage_times`.
+    """
+    play = forward_floor(work, ceilings, lanes=lanes(), half_sh=True)
+    train = forward_floor(work, ceilings, lanes=lanes()) + backward_floor(work, ceilings, lanes=lanes())
+    found = [
         {
             "name": name,
             "flops": sum(stage.flops for stage in parts),
             "bytes": sum(stage.bytes for stage in parts),
-            "floor_ms": round(sum(stage.ms for stage in parts), 3),
+            "floor_ms": round(total_ms(parts), 3),
             "ms": times[name]["median_ms"],
             "stages": [stage.report() for stage in parts],
         }
-        for name, parts in stages.items()
+        for name, parts in (("forward", play), ("forward_backward", train))
     ]
+    found[0]["measured"] = [_measured(name, ms, play) for name, ms in measured.items()]
+    return found
+
+
+def _measured(name: str, ms: float, floor: list[Stage]) -> dict[str, Any]:
+    parts = [stage for stage in floor if stage.name in STAGES[name]]
+    sums = {key: sum(getattr(stage, key) for stage in parts) for key in ("flops", "bytes")}
+    return {"name": name, "ms": ms, "floor_ms": round(total_ms(parts), 4), **sums}
 
 
 def measure_alone(
@@ -125,8 +162,11 @@ def measure_alone(
 ) -> dict[str, Any]:
     """One scene in a process of its own: times, memory, ceiling of the arithmetic. Called through `child`."""
     scene = SceneSource(folder).load(name, count=count)
-    calls = both_passes(scene, threads=threads)
-    memory = {name: round(memory_of(call), 1) for name, call in calls.items()}
+    calls = passes(scene, threads=threads)
+    memory = {
+        "forward": round(memory_of(lambda: forward(scene, threads=threads)()), 1),
+        "forward_backward": round(memory_of(calls["forward_backward"]), 1),
+    }
     times = measure(calls, runs=runs)
     return {
         "isa": _core.isa(),
@@ -141,10 +181,16 @@ def _time_scenes(scenes: dict[str, Scene], settings: Settings) -> dict[str, dict
     calls = {
         (name, kind): call
         for name, scene in scenes.items()
-        for kind, call in both_passes(scene, threads=settings.threads).items()
+        for kind, call in passes(scene, threads=settings.threads).items()
     }
     timings = measure({"/".join(key): call for key, call in calls.items()}, runs=settings.runs)
     return {name: {kind: timings[f"{name}/{kind}"].report() for kind in PASSES} for name in scenes}
+
+
+def _errors(scene: Scene, truth: Picture, settings: Settings) -> dict[str, Any]:
+    """Of the pictures of `forward` and, in its own entry, `stateless`."""
+    pictures = [make(scene, threads=settings.threads)()[0] for make in (Playing, stateless)]
+    return {**picture_error(pictures[0], truth.rgb), "stateless": picture_error(pictures[1], truth.rgb)}
 
 
 def _against_floor(times: dict[str, Any], work: Work, ceilings: Ceilings) -> dict[str, Any]:
@@ -204,6 +250,6 @@ def _over_instruction_sets(source: SceneSource, settings: Settings) -> list[dict
 
 
 def _timed(scene: Scene, settings: Settings, *, threads: int | None = None) -> dict[str, Any]:
-    calls = both_passes(scene, threads=threads or settings.threads)
+    calls = passes(scene, threads=threads or settings.threads)
     timings = measure(calls, runs=settings.short_runs)
     return {name: timing.report() for name, timing in timings.items()}
