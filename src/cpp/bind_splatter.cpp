@@ -38,6 +38,19 @@ class PySplatter {
     draw_alone(view, threads, Image8{out.mutable_data(), !background});
   }
 
+  py::array_t<std::uint32_t> order(DoubleArray viewmat, std::optional<FloatArray> vertices, int threads) {
+    expect(viewmat, "viewmat", {4, 4});
+    check_vertices(vertices);
+    py::array_t<std::uint32_t> out(static_cast<py::ssize_t>(count()));
+    std::uint32_t* to = out.mutable_data();
+    {
+      py::gil_scoped_release release;
+      std::lock_guard lock(busy_);
+      splatter_.order(viewmat.data(), vertices ? vertices->data() : nullptr, threads, to);
+    }
+    return out;
+  }
+
   std::size_t count() const { return splatter_.packed().count; }
   std::size_t drawn() const { return splatter_.last().drawn; }
   std::size_t pairs() const { return splatter_.last().pairs; }
@@ -63,12 +76,16 @@ class PySplatter {
   View checked_view(const DoubleArray& viewmat, const DoubleArray& K, int width, int height, const Background& background,
                     const std::optional<FloatArray>& vertices) const {
     const View view{checked_camera(viewmat, K, width, height), background ? background->data() : nullptr, vertices ? vertices->data() : nullptr};
+    check_vertices(vertices);
+    return view;
+  }
+
+  void check_vertices(const std::optional<FloatArray>& vertices) const {
     if (vertices.has_value() != splatter_.packed().bound()) throw std::invalid_argument("vertices: expected where, and only where, there is a binding");
     if (vertices) {
       expect(*vertices, "vertices", {vertices->ndim() ? vertices->shape(0) : 0, 3});
       if (vertices->shape(0) < vertices_needed_) throw std::invalid_argument("vertices: expected all that faces name");
     }
-    return view;
   }
 
   template <class Out>
@@ -95,6 +112,7 @@ void register_splatter(py::module_& m) {
            vertices = py::none(), py::arg("threads") = 0)
       .def("draw", &PySplatter::draw, py::arg("out").noconvert(), py::arg("viewmat"), py::arg("K"), background = py::none(), vertices = py::none(),
            py::arg("threads") = 0)
+      .def("order", &PySplatter::order, py::arg("viewmat"), vertices = py::none(), py::arg("threads") = 0)
       .def("__len__", &PySplatter::count)
       .def_property_readonly("drawn", &PySplatter::drawn)
       .def_property_readonly("pairs", &PySplatter::pairs)

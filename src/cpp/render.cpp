@@ -131,16 +131,34 @@ void render_fwd(const Camera& camera, const GaussiansView& gaussians, const floa
   each_tile(r, threads, [&](const TileJob& job) { kernels().rasterize_fwd(job, image); });
 }
 
+void Splatter::place_frames(const float* vertices, int threads) {
+  if (!packed_.bound()) return;
+  frames_.reserve(packed_.faces_count);
+  parallel_for(packed_.faces_count, kGrain, threads, [&](std::size_t begin, std::size_t end) {
+    kernels().triangle_frames(vertices, packed_.faces.get(), begin, end, frames_.get());
+  });
+}
+
+void Splatter::order(const double* viewmat, const float* vertices, int threads, std::uint32_t* order) {
+  place_frames(vertices, threads);
+  const float forward[3] = {static_cast<float>(viewmat[8]), static_cast<float>(viewmat[9]), static_cast<float>(viewmat[10])};
+  const auto offset = static_cast<float>(viewmat[11]);
+  sort_depths(packed_.count, order, threads, [&](std::size_t i) {
+    const PackedFloats* mean = &packed_.shape[i / kPack * kPackedFields + kPackedMean];
+    const float at[3] = {mean[0].lane[i % kPack], mean[1].lane[i % kPack], mean[2].lane[i % kPack]};
+    if (!packed_.bound()) return forward[0] * at[0] + forward[1] * at[1] + forward[2] * at[2] + offset;
+    const TriangleFrame& f = frames_[packed_.binding[i]];
+    float depth = offset;
+    for (int r = 0; r < 3; ++r) depth += forward[r] * (f.turn[3 * r] * at[0] + f.turn[3 * r + 1] * at[1] + f.turn[3 * r + 2] * at[2] + f.centre[r]);
+    return depth;
+  });
+}
+
 void Splatter::prepare(const View& view, int threads) {
   Rendered& r = rendered_;
   Stopwatch watch;
   begin_frame(r, view.camera, view.background);
-  if (packed_.bound()) {
-    frames_.reserve(packed_.faces_count);
-    parallel_for(packed_.faces_count, kGrain, threads, [&](std::size_t begin, std::size_t end) {
-      kernels().triangle_frames(view.vertices, packed_.faces.get(), begin, end, frames_.get());
-    });
-  }
+  place_frames(view.vertices, threads);
   r.seconds.frames = watch.lap();
   project_all(r, packed_.count, threads, [&](std::size_t begin, std::size_t end, TileBox* boxes) {
     kernels().project_packed(r.camera, packed_, frames_.get(), begin, end, r.splats.get(), r.radii.get(), boxes);

@@ -62,11 +62,15 @@ class Splatter {
   void draw(const View& view, int threads, const Image& image);
   void draw(const View& view, int threads, const Image8& image);
 
+  // order [N]: near to far along the third row of `viewmat` [4, 4]; equal depths keep their order, non-finite ones come last.
+  void order(const double* viewmat, const float* vertices, int threads, std::uint32_t* order);
+
   const Packed& packed() const { return packed_; }
   const Rendered& last() const { return rendered_; }
 
  private:
   void prepare(const View& view, int threads);
+  void place_frames(const float* vertices, int threads);
 
   Packed packed_;
   Scratch<TriangleFrame> frames_;

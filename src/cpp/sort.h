@@ -2,6 +2,7 @@
 #pragma once
 #include <algorithm>
 #include <bit>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <utility>
@@ -56,8 +57,30 @@ Record* sort_by_key(Record* records, std::size_t count, SortSpace<Record>& space
   return from;
 }
 
-// order [N]: indices of means [N, 3] near to far along the camera's axis (third row of viewmat [4, 4]); equal depths keep
-// their order. Depths that are not finite come last.
+// order [count]: indices near to far by `depth_of(index)`; equal depths keep their order, those that are not finite come last.
+template <class DepthOf>
+void sort_depths(std::size_t count, std::uint32_t* order, int threads, const DepthOf& depth_of) {
+  constexpr std::size_t kGrain = 8192;
+  struct Depth {
+    std::uint32_t key, id;
+  };
+  auto depths = make_buffer<Depth>(count);
+  SortSpace<Depth> space;
+  parallel_for(count, kGrain, threads, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; ++i) {
+      const float depth = depth_of(i);
+      const auto bits = std::bit_cast<std::uint32_t>(depth);
+      // Unsigned order = numeric order: negative floats are flipped whole, others get the top bit.
+      depths[i] = {!std::isfinite(depth) ? 0xffffffffu : bits & 0x80000000u ? ~bits : bits | 0x80000000u, static_cast<std::uint32_t>(i)};
+    }
+  });
+  const Depth* sorted = sort_by_key(depths.get(), count, space, threads);
+  parallel_for(count, kGrain, threads, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; ++i) order[i] = sorted[i].id;
+  });
+}
+
+// The same of means [N, 3] along the camera's axis, the third row of viewmat [4, 4].
 void sort_by_depth(const float* means, std::size_t count, const float* viewmat, std::uint32_t* order, int threads);
 
 }  // namespace cap4d
