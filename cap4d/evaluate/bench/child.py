@@ -44,9 +44,15 @@ def in_child(task: str, *, environment: dict[str, str] | None = None, **argument
 
 
 def splat_task(**arguments: Any) -> dict[str, Any]:
-    from cap4d.evaluate.bench.splatting import measure_alone
+    from cap4d.evaluate.bench.scaling import measure_alone
 
     return measure_alone(**arguments)
+
+
+def memory_task(**arguments: Any) -> dict[str, Any]:
+    from cap4d.evaluate.bench.splatting import memory_alone
+
+    return memory_alone(**arguments)
 
 
 def frame_task(**arguments: Any) -> dict[str, Any]:
@@ -55,7 +61,11 @@ def frame_task(**arguments: Any) -> dict[str, Any]:
     return memory_alone(**arguments)
 
 
-TASKS: dict[str, Callable[..., dict[str, Any]]] = {"splat": splat_task, "frame": frame_task}
+TASKS: dict[str, Callable[..., dict[str, Any]]] = {
+    "splat": splat_task,
+    "memory": memory_task,
+    "frame": frame_task,
+}
 
 
 def main() -> None:

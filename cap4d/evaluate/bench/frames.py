@@ -4,6 +4,7 @@ picture.
 
 from __future__ import annotations
 
+import copy
 import logging
 import time
 from collections.abc import Iterator
@@ -173,7 +174,7 @@ def _configurations(
     degree = SH_COUNTS[next(iter(tiers.values())).bundle.sh.shape[1]]
     plans = [(tier, d, SIDE) for tier in tiers for d in range(degree + 1)]
     plans += [(tier, degree, side) for tier in tiers for side in SMALLER_SIDES]
-    avatars = {plan: _reduced(tiers[plan[0]], plan[1], settings) for plan in plans}
+    avatars = {plan: _with_sh_degree(tiers[plan[0]], plan[1]) for plan in plans}
     views = {plan: camera.resized(plan[2], plan[2]) for plan in plans}
     seconds = time_blocks(
         {str(plan): _player(avatars[plan], views[plan]) for plan in plans}, settings.short_runs
@@ -190,15 +191,12 @@ def _configurations(
     ]
 
 
-def _reduced(avatar: Avatar, degree: int, settings: Settings) -> Avatar:
-    """The same avatar and tier with SH up to a degree."""
+def _with_sh_degree(avatar: Avatar, degree: int) -> Avatar:
+    """The same avatar, network and all, drawn with SH up to a degree."""
     count = (degree + 1) ** 2
     if count == avatar.bundle.sh.shape[1]:
         return avatar
-    bundle = replace(avatar.bundle, sh=np.ascontiguousarray(avatar.bundle.sh[:, :count]))
-    return Avatar(bundle, deformer=_tier(avatar), threads=settings.threads)
-
-
-def _tier(avatar: Avatar) -> str:
-    """The name of its tier."""
-    return avatar.tier if hasattr(avatar, "tier") else ("off" if avatar.deformer is None else "full")
+    reduced = copy.copy(avatar)
+    reduced.bundle = replace(avatar.bundle, sh=np.ascontiguousarray(avatar.bundle.sh[:, :count]))
+    reduced.splatter = Avatar(reduced.bundle, deformer="off").splatter
+    return reduced

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from cap4d.evaluate.bench.accuracy import picture_error
+from cap4d.evaluate.bench.passes import Playing, forward_backward, random_gradient
 from cap4d.evaluate.bench.scenes import Scene, SceneSource
 from cap4d.evaluate.bench.settings import Settings
-from cap4d.evaluate.bench.splatting import forward, forward_backward
 from cap4d.evaluate.bench.tiled import (
     EPS2D,
     TRANSMITTANCE_MIN,
@@ -81,7 +81,7 @@ def find_peers(scene: Scene, settings: Settings) -> tuple[dict[str, Peer], list[
 
 
 def _compare(scene: Scene, truth: Picture, peers: dict[str, Peer], settings: Settings) -> dict[str, Any]:
-    makers = {"forward": forward, "forward_backward": forward_backward}
+    makers = {"forward": Playing, "forward_backward": forward_backward}
     ours = {kind: make(scene, threads=settings.threads) for kind, make in makers.items()}
     calls = {("ours", kind): call for kind, call in ours.items()}
     for name, peer in peers.items():
@@ -119,7 +119,7 @@ def _gsplat_peer(scene: Scene, settings: Settings) -> Peer:
     position = torch.tensor(scene.camera.position, dtype=torch.float32)
     gaussian_ids, pixel_ids = map(torch.from_numpy, blended_pairs(scene))
     image_ids = torch.zeros_like(gaussian_ids)
-    v_rgb = torch.from_numpy(np.random.default_rng(0).normal(size=(height, width, 3)).astype(np.float32))
+    v_rgb = torch.from_numpy(random_gradient(scene))
 
     def draw(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any) -> Any:
         covariances, _ = functions._quat_scale_to_covar_preci(quats, scales, compute_preci=False)

@@ -11,6 +11,7 @@ from cap4d.evaluate.bench.figure import AMBER, BLUE, FAINT, GREEN, INK, RED, VIO
 Report = dict[str, Any]
 TIERS = {"full": BLUE, "fp16": VIOLET, "int8": GREEN, "linear": AMBER, "off": FAINT}
 STAGES = (BLUE, RED, GREEN, AMBER, VIOLET, "#4f7ca8", "#a87c4f", "#5b8c5a")
+SUMS = ("frame", "splat")  # of other stages
 MARKERS = {384: "v", 256: "^"}  # of pictures drawn smaller, by their side
 
 
@@ -40,7 +41,7 @@ def draw_frames(figure: Any, report: Report) -> None:
     avatars = report["frame"]
     figure.set_size_inches(12, 1.2 + 0.55 * sum(len(avatar["tiers"]) + 1.5 for avatar in avatars))
     names = list(dict.fromkeys(s for a in avatars for row in a["tiers"] for s in row["stages"]))
-    colours = dict(zip([name for name in names if name != "frame"], STAGES, strict=False))
+    colours = dict(zip([name for name in names if name not in SUMS], STAGES, strict=False))
     for i, avatar in enumerate(avatars):
         title = f"{avatar['avatar']}: a frame of {avatar['gaussians']:,} Gaussians at {avatar['side']} px"
         _frame_panel(add_axes(figure, (len(avatars), 1, i + 1), title, "ms, medians", ""), avatar, colours)

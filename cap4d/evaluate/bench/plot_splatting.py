@@ -109,8 +109,8 @@ def draw_roofline(figure: Any, report: Report) -> None:
         axes.loglog(
             x, np.minimum(roofs["gflops"], roofs[name] * x), style, color=FAINT, linewidth=1.4, label=label
         )
-    axes.annotate(f"multiply-add peak, {roofs['gflops']:.0f} GFLOP/s", (x[-1], roofs["gflops"]), xytext=(0, 4),
-                  textcoords="offset points", ha="right", fontsize=9)  # fmt: skip
+    peak, offset = f"multiply-add peak, {roofs['gflops']:.0f} GFLOP/s", {"textcoords": "offset points"}
+    axes.annotate(peak, (x[-1], roofs["gflops"]), xytext=(0, 4), ha="right", fontsize=9, **offset)
     for entry in splat["roofline"]:
         text, colour = PASSES[entry["name"]]
         intensity = entry["flops"] / entry["bytes"]

@@ -15,6 +15,7 @@ from cap4d.evaluate.bench.deforming import measure_deformer
 from cap4d.evaluate.bench.fitting import measure_fitting
 from cap4d.evaluate.bench.frames import measure_frames
 from cap4d.evaluate.bench.machine import describe_machine
+from cap4d.evaluate.bench.passes import lanes
 from cap4d.evaluate.bench.peers import measure_peers
 from cap4d.evaluate.bench.plots import draw_plots
 from cap4d.evaluate.bench.report import write_report
@@ -28,7 +29,7 @@ from cap4d.evaluate.bench.show import (
     splatting_shows,
     verdict,
 )
-from cap4d.evaluate.bench.splatting import MAIN, lanes, measure_splatting
+from cap4d.evaluate.bench.splatting import measure_splatting
 
 log = logging.getLogger(__name__)
 
@@ -80,8 +81,8 @@ def measure_sections(
     """Adds what each section measured, and a line to `not_measured` for what could not be."""
     missing = report["not_measured"]
     if "splat" in settings.sections:
-        found = measure_splatting(source, settings, ceilings)
-        report["splat"] = {"source": source.kind, "main": MAIN, **found}
+        report["splat"] = measure_splatting(source, settings, ceilings)
+        missing += report["splat"].pop("not_measured", [])
     if "fit" in settings.sections:
         report["fit"] = measure_fitting(settings, ceilings[settings.threads])
         missing += report["fit"].pop("not_measured")

@@ -49,8 +49,8 @@ def splat(found: Report) -> Iterator[str]:
     yield from table(head, (_times(row) for row in found["scenes"]))
     yield "`forward` draws for the eye: Gaussians prepared once, colours in float16, as the player does it;"
     yield "`stateless` draws float32 Gaussians that may be others each time; `forward + backward` gives all"
-    yield "gradients. `of floor`: the time that the counted work takes at the machine's ceilings (below), over"
-    yield "the time measured. `ns a pair`: of `forward`, for each blended pixel-Gaussian pair."
+    yield "gradients. `of floor`: the time that the counted work takes at the machine's ceilings (below),"
+    yield "over the time measured. `ns a pair`: of `forward`, for each blended pixel-Gaussian pair."
     yield ""
     head = (
         "scene",
@@ -169,8 +169,8 @@ def frame(avatars: list[Report]) -> Iterator[str]:
     for avatar in avatars:
         side = avatar["side"]
         yield from (f"### {avatar['avatar']}", "")
-        yield f"{avatar['gaussians']:,} Gaussians of SH degree {avatar['sh_degree']}, {side} x {side}; pictures"
-        yield f"against `{avatar['truth']}` drawn in float64, {avatar['samples']} frames."
+        yield f"{avatar['gaussians']:,} Gaussians of SH degree {avatar['sh_degree']}, {side} px;"
+        yield f"pictures against `{avatar['truth']}` drawn in float64, {avatar['samples']} frames."
         yield ""
         yield from table(
             ("tier", "fps", "median", "p95", "p99", "p99 / median", "PSNR, dB", "memory, MB"),
