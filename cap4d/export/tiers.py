@@ -44,7 +44,8 @@ def with_tiers(bundle: Bundle, clips: Sequence[Clip] = ()) -> Bundle:
         deform_linear=distill(bundle, network, fit),
         deform_int8=quantize(bundle.deform_onnx, calibration),
     )
-    bundle = replace(bundle, tier_errors=tier_errors(bundle, held_out.all()))
+    known = {tier: errors for tier, errors in bundle.tier_errors.items() if tier == "full"}
+    bundle = replace(bundle, tier_errors=known | tier_errors(bundle, held_out.all()))
     log.info(
         "cheaper deformers made in %.1f s; vertices are off by (RMS, at most):", time.monotonic() - started
     )

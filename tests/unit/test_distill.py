@@ -88,7 +88,8 @@ def test_every_tier_is_made_measured_and_stored(bundle: Bundle, tmp_path) -> Non
     np.testing.assert_array_equal(read.deform_linear, made.deform_linear)
     for tier, pair in read.tier_errors.items():
         np.testing.assert_allclose(pair, errors[tier], rtol=1e-4)
-    again = with_tiers(bundle)
+    again = with_tiers(replace(bundle, tier_errors={"full": (1e-6, 1e-5), "int8": (9.0, 9.0)}))
+    assert again.tier_errors == {"full": (1e-6, 1e-5), **errors}
     np.testing.assert_array_equal(again.deform_linear, made.deform_linear)
     bare = replace(bundle, deform_onnx=None)
     assert with_tiers(bare) is bare
