@@ -28,6 +28,9 @@ inline constexpr float kRadiusSigmas = 3.0f;
 
 inline constexpr int kTileLog2 = 4;
 inline constexpr int kTile = 1 << kTileLog2;  // px a side; the unit of work of a thread and of binning
+// Cameras take their numbers from the nearest point of a grid this wide, m: a head's own camera from the origin, which costs no digit.
+inline constexpr double kPivotStep = 16.0;
+
 inline constexpr int kMaxSide = 16384;       // px; larger images are refused
 
 inline constexpr double kPi = 3.14159265358979323846;

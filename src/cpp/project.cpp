@@ -44,7 +44,7 @@ struct Direction {
 
 CAP4D_INLINE Direction view_direction(const Camera& camera, const Shape3<FloatV>& shape) {
   Direction d;
-  for (int i = 0; i < 3; ++i) d.unit[i] = shape.mean[i] - camera.position[i];
+  for (int i = 0; i < 3; ++i) d.unit[i] = (shape.mean[i] - camera.pivot[i]) - camera.position[i];
   const FloatV norm2 = d.unit[0] * d.unit[0] + d.unit[1] * d.unit[1] + d.unit[2] * d.unit[2];
   d.inverse_norm = 1.0f / sqrt(max(norm2, splat(1e-12f)));
   for (int i = 0; i < 3; ++i) d.unit[i] = d.unit[i] * d.inverse_norm;

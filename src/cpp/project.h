@@ -82,9 +82,9 @@ struct Projection {
 template <class T>
 CAP4D_INLINE Projection<T> project(const Camera& camera, const Shape3<T>& g) {
   Projection<T> p;
+  const T arm[3] = {g.mean[0] - camera.pivot[0], g.mean[1] - camera.pivot[1], g.mean[2] - camera.pivot[2]};
   for (int i = 0; i < 3; ++i)
-    p.view[i] = camera.rotation[i][0] * g.mean[0] + camera.rotation[i][1] * g.mean[1] + camera.rotation[i][2] * g.mean[2] +
-                camera.translation[i];
+    p.view[i] = camera.rotation[i][0] * arm[0] + camera.rotation[i][1] * arm[1] + camera.rotation[i][2] * arm[2] + camera.translation[i];
   p.inverse_z = 1.0f / p.view[2];
   const T zero = 0.0f * p.inverse_z;
   const float focal[2] = {camera.fx, camera.fy}, centre[2] = {camera.cx, camera.cy};
