@@ -20,6 +20,7 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
 QUAT_MIN = 1e-12
+DEPTH_MAX = 1e7  # m
 COLOR_MAX = 1e6
 RADIUS_SIGMAS = 3.0
 
@@ -95,12 +96,15 @@ def rasterize_reference(
 def drawable(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera
 ) -> Tensor:
-    """bool[N]: finite in every field, in front of the camera, not too faint to see, and of a sane colour."""
+    """bool[N]: finite in every field, in front of the camera, not too far away or too faint to see, and of
+    a sane colour.
+    """
     with torch.no_grad():
         depths = means @ means.new_tensor(camera.viewmat[2, :3]) + camera.viewmat[2, 3]
         fields = (means, quats, scales, opacities[:, None])
         finite = torch.stack([torch.isfinite(x).all(1) for x in fields]).all(0)
-        return finite & (depths >= NEAR) & (opacities >= ALPHA_MIN) & (colors.abs() <= COLOR_MAX).all(1)
+        placed = (depths >= NEAR) & (depths <= DEPTH_MAX)
+        return finite & placed & (opacities >= ALPHA_MIN) & (colors.abs() <= COLOR_MAX).all(1)
 
 
 def project(

@@ -23,6 +23,8 @@ inline constexpr float kQuatMin = 1e-12f;
 inline constexpr float kSafeNorm2 = 1e-20f;
 // A Gaussian with a colour beyond this is bad data and not drawn: sums and gradients of what is drawn cannot overflow.
 inline constexpr float kColorMax = 1e6f;
+// A Gaussian farther than this is bad data too, m: squares of its depth and of what divides by it stay in float32.
+inline constexpr float kDepthMax = 1e7f;
 // How far out, in standard deviations, the radius that densification prunes by reaches (3DGS).
 inline constexpr float kRadiusSigmas = 3.0f;
 

@@ -97,9 +97,10 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     const FloatV height2 = reach * f.yy, height = sqrt(height2), width = sqrt(reach * f.xx);
     const FloatV slope = f.xy / f.yy;
     const FloatV finite = (f.x + f.y) * 0.0f + f.inv_xx * 0.0f + f.inv_uu * 0.0f + f.shear * 0.0f + f.det * 0.0f +
-                          (height2 + width) * 0.0f + opacity * 0.0f + (shape.quat[0] + shape.quat[1]) * 0.0f;
+                          (height2 + width) * 0.0f + opacity * 0.0f + shape.quat[0] * 0.0f;
     MaskV drawn = less_equal(splat(0.0f), finite);  // false for NaN
-    drawn = both(drawn, both(less_equal(splat(kNear), f.depth), less_equal(splat(kAlphaMin), opacity)));
+    drawn = both(drawn, both(less_equal(splat(kNear), f.depth), less_equal(f.depth, splat(kDepthMax))));
+    drawn = both(drawn, less_equal(splat(kAlphaMin), opacity));
     drawn = both(drawn, both(less(splat(0.0f), f.x + width), less(f.x - width, splat(static_cast<float>(camera.width)))));
     drawn = both(drawn, both(less(splat(0.0f), f.y + height), less(f.y - height, splat(static_cast<float>(camera.height)))));
     std::uint32_t todo = bits(drawn) & ((1u << count) - 1);
@@ -188,8 +189,8 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     // in (dx, u).
     const FloatV v_y = f.inv_uu * load(received[6]);
     const FootprintGrad<FloatV> v = {f.inv_xx * load(received[5]) - f.shear * v_y, v_y, load(received[3]),
-                                     0.5f * f.inv_xx * f.inv_xx * load(received[7]), 0.5f * f.inv_xx * f.inv_uu * load(received[8]),
-                                     0.5f * f.inv_uu * f.inv_uu * load(received[9])};
+                                     0.5f * f.inv_xx * (f.inv_xx * load(received[7])), 0.5f * f.inv_xx * (f.inv_uu * load(received[8])),
+                                     0.5f * f.inv_uu * (f.inv_uu * load(received[9]))};
     Shape3<FloatV> v_shape = project_vjp(camera, shape, p, v);
 
     const Direction direction = view_direction(camera, shape);
@@ -212,6 +213,9 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     }
     for (int k = 0; k < used; ++k) v_basis_v[k] = load(v_basis[k]);
     sh_basis_vjp(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], v_basis_v, v_unit);
+    // Where a basis function is 0, its coefficient may be anything that is a number and the colour still sane.
+    const MaskV fits = less(absolute(v_unit[0]) + absolute(v_unit[1]) + absolute(v_unit[2]), splat(1e30f));  // false for NaN
+    for (int i = 0; i < 3; ++i) v_unit[i] = keep(fits, v_unit[i]);
     const FloatV along = v_unit[0] * direction.unit[0] + v_unit[1] * direction.unit[1] + v_unit[2] * direction.unit[2];
     for (int i = 0; i < 3; ++i)
       v_shape.mean[i] = v_shape.mean[i] + (v_unit[i] - along * direction.unit[i]) * direction.inverse_norm;
