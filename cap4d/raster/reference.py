@@ -68,9 +68,12 @@ def rasterize_reference(
             never end, and alpha is 0.99 times the opacity times the density.
     """
     gaussians = tuple(x.double() for x in (means, quats, scales, opacities, sh))
-    colors = eval_sh(gaussians[4], gaussians[0] - gaussians[0].new_tensor(camera.position), sh_degree)
-    keep = drawable(*gaussians[:4], colors, camera)
-    means, quats, scales, opacities, colors = (x[keep] for x in (*gaussians[:4], colors))
+    position = gaussians[0].new_tensor(camera.position)
+    with torch.no_grad():
+        keep = drawable(*gaussians[:4], eval_sh(gaussians[4], gaussians[0] - position, sh_degree), camera)
+    # Only now with gradients: those of bad numbers would be 0 times them.
+    means, quats, scales, opacities, sh = (x[keep] for x in gaussians)
+    colors = eval_sh(sh, means - position, sh_degree)
     projected = project(means, quats, scales, opacities, camera=camera)
     ids, means2d = projected.ids, projected.means2d
     colors = colors[ids].clamp(min=0)
