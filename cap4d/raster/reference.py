@@ -20,6 +20,7 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
 QUAT_MIN = 1e-12
+DEPTH_MAX = 1e7  # m
 COLOR_MAX = 1e6
 RADIUS_SIGMAS = 3.0
 
@@ -70,9 +71,12 @@ def rasterize_reference(
             never end, and alpha is 0.99 times the opacity times the density.
     """
     gaussians = tuple(x.double() for x in (means, quats, scales, opacities, sh))
-    colors = eval_sh(gaussians[4], gaussians[0] - gaussians[0].new_tensor(camera.position), sh_degree)
-    keep = drawable(*gaussians[:4], colors, camera)
-    means, quats, scales, opacities, colors = (x[keep] for x in (*gaussians[:4], colors))
+    position = gaussians[0].new_tensor(camera.position)
+    with torch.no_grad():
+        keep = drawable(*gaussians[:4], eval_sh(gaussians[4], gaussians[0] - position, sh_degree), camera)
+    # Only now with gradients: those of bad numbers would be 0 times them.
+    means, quats, scales, opacities, sh = (x[keep] for x in gaussians)
+    colors = eval_sh(sh, means - position, sh_degree)
     projected = project(means, quats, scales, opacities, camera=camera)
     ids, means2d = projected.ids, projected.means2d
     colors = colors[ids].clamp(min=0)
@@ -99,12 +103,15 @@ def rasterize_reference(
 def drawable(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera
 ) -> Tensor:
-    """bool[N]: finite in every field, in front of the camera, not too faint to see, and of a sane colour."""
+    """bool[N]: finite in every field, in front of the camera, not too far away or too faint to see, and of
+    a sane colour.
+    """
     with torch.no_grad():
         depths = means @ means.new_tensor(camera.viewmat[2, :3]) + camera.viewmat[2, 3]
         fields = (means, quats, scales, opacities[:, None])
         finite = torch.stack([torch.isfinite(x).all(1) for x in fields]).all(0)
-        return finite & (depths >= NEAR) & (opacities >= ALPHA_MIN) & (colors.abs() <= COLOR_MAX).all(1)
+        placed = (depths >= NEAR) & (depths <= DEPTH_MAX)
+        return finite & placed & (opacities >= ALPHA_MIN) & (colors.abs() <= COLOR_MAX).all(1)
 
 
 def project(

@@ -5,8 +5,11 @@ namespace cap4d {
 
 struct Camera {
   float rotation[3][3];  // view from world
-  float translation[3];  // m
-  float position[3];     // the optical centre in the world, m
+  // A point near the camera that float32 holds exactly, m; the origin, unless the camera is metres away from that. What is taken
+  // from it before it is rotated has lost no digits, where rotation * mean + translation would cancel.
+  float pivot[3];
+  float translation[3];  // view of the pivot, m
+  float position[3];     // the optical centre in the world less the pivot, m
   float fx, fy, cx, cy;  // px
   float x_min, x_max, y_min, y_max;  // where the projection's Jacobian is clamped, in x / z and y / z
   int width, height;     // px

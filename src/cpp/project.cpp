@@ -47,7 +47,7 @@ struct Direction {
 
 CAP4D_INLINE Direction view_direction(const Camera& camera, const FloatV* mean) {
   Direction d;
-  for (int i = 0; i < 3; ++i) d.unit[i] = mean[i] - camera.position[i];
+  for (int i = 0; i < 3; ++i) d.unit[i] = (mean[i] - camera.pivot[i]) - camera.position[i];
   const FloatV norm2 = d.unit[0] * d.unit[0] + d.unit[1] * d.unit[1] + d.unit[2] * d.unit[2];
   d.inverse_norm = 1.0f / sqrt(max(norm2, splat(1e-12f)));
   for (int i = 0; i < 3; ++i) d.unit[i] = d.unit[i] * d.inverse_norm;
@@ -98,7 +98,8 @@ CAP4D_INLINE Extent extent_of(const Camera& camera, const Footprint<FloatV>& f, 
   e.reach = 1.38629436f * (exponent - kLog2AlphaMin) + 1e-4f;
   e.height2 = e.reach * f.yy, e.height = sqrt(e.height2), e.width = sqrt(e.reach * f.xx);
   const FloatV finite = (f.x + f.y) * 0.0f + f.inv_xx * 0.0f + f.inv_uu * 0.0f + f.shear * 0.0f + f.det * 0.0f + (e.height2 + e.width) * 0.0f;
-  e.drawn = both(less_equal(splat(0.0f), finite), less_equal(splat(kNear), f.depth));  // false for NaN
+  e.drawn = less_equal(splat(0.0f), finite);  // false for NaN
+  e.drawn = both(e.drawn, both(less_equal(splat(kNear), f.depth), less_equal(f.depth, splat(kDepthMax))));
   e.drawn = both(e.drawn, both(less(splat(0.0f), f.x + e.width), less(f.x - e.width, splat(static_cast<float>(camera.width)))));
   e.drawn = both(e.drawn, both(less(splat(0.0f), f.y + e.height), less(f.y - e.height, splat(static_cast<float>(camera.height)))));
   return e;
@@ -137,7 +138,7 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     const Footprint<FloatV> f = project(camera, shape).footprint;
     const FloatV exponent = log2_positive(max(opacity, splat(kAlphaMin)));
     const Extent extent = extent_of(camera, f, exponent);
-    const FloatV finite = opacity * 0.0f + (shape.quat[0] + shape.quat[1]) * 0.0f + (shape.quat[2] + shape.quat[3]) * 0.0f;
+    const FloatV finite = opacity * 0.0f + shape.quat[0] * 0.0f;
     const MaskV drawn = both(extent.drawn, both(less_equal(splat(0.0f), finite), less_equal(splat(kAlphaMin), opacity)));
     const std::uint32_t todo = bits(drawn) & ((1u << count) - 1);
     if (!todo) {
@@ -162,13 +163,14 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
 // prepared Gaussians ------------------------------------------------------------------------------------------------------------
 
 // Makes rotations times the size of the frames of flat triangles.
-void turn_upright(FloatV* frame) {
+void turn_upright(const float* const* rows, FloatV* frame) {
   for (int l = 0; l < kLanes; ++l) {
-    if (frame[13][l] == 0) continue;
-    float axes[9], rotmat[9];
-    for (int i = 0; i < 9; ++i) axes[i] = frame[i][l] / frame[12][l];
-    upright(axes, rotmat);
-    for (int i = 0; i < 9; ++i) frame[i][l] = rotmat[i] * frame[12][l];
+    TriangleFrame f;
+    std::memcpy(&f, rows[l], sizeof f);
+    if (f.flat == 0) continue;
+    float rotmat[9];
+    upright(f, rotmat);
+    for (int i = 0; i < 9; ++i) frame[i][l] = rotmat[i] * f.size;
   }
 }
 
@@ -178,14 +180,15 @@ CAP4D_INLINE void to_world(const TriangleFrame* frames, const std::int32_t* bind
   for (int l = 0; l < kLanes; ++l) rows[l] = frames[binding[l]].turn;
   FloatV frame[16];
   load_rows8(rows, frame);
-  for (const float*& row : rows) row += 8;
-  load_rows8(rows, frame + 8);
+  const float* rest[kLanes];
+  for (int l = 0; l < kLanes; ++l) rest[l] = rows[l] + 8;
+  load_rows8(rest, frame + 8);
   const FloatV local[3] = {mean[0], mean[1], mean[2]};
   for (int i = 0; i < 3; ++i) {
     const FloatV* turn = frame + 3 * i;
     mean[i] = turn[0] * local[0] + turn[1] * local[1] + turn[2] * local[2] + frame[9 + i];
   }
-  if (any(less(splat(0.0f), frame[13]))) [[unlikely]] turn_upright(frame);
+  if (any(less(splat(0.0f), frame[13]))) [[unlikely]] turn_upright(rows, frame);
   FloatV turned[9];
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) turned[3 * i + j] = frame[3 * i] * root[j] + frame[3 * i + 1] * root[3 + j] + frame[3 * i + 2] * root[6 + j];
@@ -240,6 +243,9 @@ CAP4D_INLINE void safe_normalize(FloatV* v) {
   for (int i = 0; i < 3; ++i) v[i] = v[i] * inverse;
 }
 
+// A triangle lower than this part of its side is a sliver, whose normal float32 cannot tell.
+constexpr float kSliver = 1e-2f;
+
 void triangle_frames(const float* vertices, const std::int32_t* faces, std::size_t begin, std::size_t end, TriangleFrame* frames) {
   for (std::size_t first = begin; first < end; first += kLanes) {
     const int count = static_cast<int>(std::min<std::size_t>(kLanes, end - first));
@@ -253,18 +259,23 @@ void triangle_frames(const float* vertices, const std::int32_t* faces, std::size
     for (int i = 0; i < 3; ++i) {
       const FloatV v0 = load(lanes[i]), v1 = load(lanes[3 + i]), v2 = load(lanes[6 + i]);
       a0[i] = edge[i] = v1 - v0, side[i] = v2 - v0;
-      frame[9 + i] = (v0 + v1 + v2) / 3.0f;
+      frame[9 + i] = v0 + (edge[i] + side[i]) * (1.0f / 3.0f);
     }
     safe_normalize(a0);
     cross(a0, side, a1);
+    const MaskV sound = less(kSliver * kSliver * dot(side, side), dot(a1, a1));  // false for NaN
     safe_normalize(a1);
     cross(a0, a1, a2);  // -(a1 x a0)
     const FloatV height = dot(a2, side);
     const FloatV size = 0.5f * (sqrt(max(dot(edge, edge), splat(kSafeNorm2))) + max(height, -height));
     for (int i = 0; i < 3; ++i) frame[3 * i] = size * a0[i], frame[3 * i + 1] = size * a1[i], frame[3 * i + 2] = size * a2[i];
     frame[12] = size;
-    frame[13] = select(less(dot(a1, a1), splat(0.5f)), splat(1.0f), splat(0.0f));
-    store_rows16(frame, frames[first].turn, (1u << count) - 1);
+    const std::uint32_t whole = (1u << count) - 1;
+    store_rows16(frame, frames[first].turn, whole & bits(sound));
+    for (std::uint32_t slivers = whole & ~bits(sound); slivers; slivers &= slivers - 1) {
+      const std::size_t id = first + __builtin_ctz(slivers);
+      frames[id] = triangle_frame(vertices, faces + 3 * id);
+    }
   }
 }
 
@@ -324,8 +335,8 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     // in (dx, u).
     const FloatV v_y = f.inv_uu * load(received[6]);
     const FootprintGrad<FloatV> v = {f.inv_xx * load(received[5]) - f.shear * v_y, v_y, load(received[3]),
-                                     0.5f * f.inv_xx * f.inv_xx * load(received[7]), 0.5f * f.inv_xx * f.inv_uu * load(received[8]),
-                                     0.5f * f.inv_uu * f.inv_uu * load(received[9])};
+                                     0.5f * f.inv_xx * (f.inv_xx * load(received[7])), 0.5f * f.inv_xx * (f.inv_uu * load(received[8])),
+                                     0.5f * f.inv_uu * (f.inv_uu * load(received[9]))};
     Shape3<FloatV> v_shape = project_vjp(camera, shape, p, v);
 
     const Direction direction = view_direction(camera, shape.mean);
@@ -348,6 +359,9 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     }
     for (int k = 0; k < used; ++k) v_basis_v[k] = load(v_basis[k]);
     sh_basis_vjp(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], v_basis_v, v_unit);
+    // Where a basis function is 0, its coefficient may be anything that is a number and the colour still sane.
+    const MaskV fits = less(absolute(v_unit[0]) + absolute(v_unit[1]) + absolute(v_unit[2]), splat(1e30f));  // false for NaN
+    for (int i = 0; i < 3; ++i) v_unit[i] = keep(fits, v_unit[i]);
     const FloatV along = v_unit[0] * direction.unit[0] + v_unit[1] * direction.unit[1] + v_unit[2] * direction.unit[2];
     for (int i = 0; i < 3; ++i)
       v_shape.mean[i] = v_shape.mean[i] + (v_unit[i] - along * direction.unit[i]) * direction.inverse_norm;

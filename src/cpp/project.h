@@ -82,8 +82,9 @@ struct Projection {
 // The mean in the camera and in the image, and the Jacobian of the perspective there.
 template <class T>
 CAP4D_INLINE void project_mean(const Camera& camera, const T* mean, Projection<T>& p, T* position) {
+  const T arm[3] = {mean[0] - camera.pivot[0], mean[1] - camera.pivot[1], mean[2] - camera.pivot[2]};
   for (int i = 0; i < 3; ++i)
-    p.view[i] = camera.rotation[i][0] * mean[0] + camera.rotation[i][1] * mean[1] + camera.rotation[i][2] * mean[2] + camera.translation[i];
+    p.view[i] = camera.rotation[i][0] * arm[0] + camera.rotation[i][1] * arm[1] + camera.rotation[i][2] * arm[2] + camera.translation[i];
   p.inverse_z = 1.0f / p.view[2];
   const T zero = 0.0f * p.inverse_z;
   const float focal[2] = {camera.fx, camera.fy}, centre[2] = {camera.cx, camera.cy};

@@ -141,16 +141,15 @@ void Splatter::place_frames(const float* vertices, int threads) {
 
 void Splatter::order(const double* viewmat, const float* vertices, int threads, std::uint32_t* order) {
   place_frames(vertices, threads);
-  const float forward[3] = {static_cast<float>(viewmat[8]), static_cast<float>(viewmat[9]), static_cast<float>(viewmat[10])};
-  const auto offset = static_cast<float>(viewmat[11]);
+  const double forward[3] = {viewmat[8], viewmat[9], viewmat[10]}, offset = viewmat[11];
   sort_depths(packed_.count, order, threads, [&](std::size_t i) {
     const PackedFloats* mean = &packed_.shape[i / kPack * kPackedFields + kPackedMean];
     const float at[3] = {mean[0].lane[i % kPack], mean[1].lane[i % kPack], mean[2].lane[i % kPack]};
-    if (!packed_.bound()) return forward[0] * at[0] + forward[1] * at[1] + forward[2] * at[2] + offset;
-    const TriangleFrame& f = frames_[packed_.binding[i]];
-    float depth = offset;
-    for (int r = 0; r < 3; ++r) depth += forward[r] * (f.turn[3 * r] * at[0] + f.turn[3 * r + 1] * at[1] + f.turn[3 * r + 2] * at[2] + f.centre[r]);
-    return depth;
+    const TriangleFrame* f = packed_.bound() ? &frames_[packed_.binding[i]] : nullptr;
+    double depth = offset;  // in double: far from the origin the sum cancels
+    for (int r = 0; r < 3; ++r)
+      depth += forward[r] * (f ? f->turn[3 * r] * at[0] + f->turn[3 * r + 1] * at[1] + f->turn[3 * r + 2] * at[2] + f->centre[r] : at[r]);
+    return static_cast<float>(depth);
   });
 }
 
