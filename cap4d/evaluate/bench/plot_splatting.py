@@ -84,7 +84,7 @@ def _draw_curve(axes: Any, rows: list[Report], name: str) -> None:
 
 
 def _draw_memory(axes: Any, splat: Report) -> None:
-    rows = [row for row in splat["scenes"] if row["memory_mb"]]
+    rows = [row for row in splat["scenes"] if None not in row["memory_mb"].values()]
     for i, (key, (_, colour)) in enumerate(PASSES.items()):
         places = np.arange(len(rows)) + 0.4 * i - 0.2
         axes.bar_label(

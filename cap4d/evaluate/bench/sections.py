@@ -104,7 +104,7 @@ def _times(row: Report) -> tuple[object, ...]:
 
 
 def _errors(row: Report) -> tuple[object, ...]:
-    memory, error, alone = row["memory_mb"] or {}, row["error"], row["error"]["stateless"]
+    memory, error, alone = row["memory_mb"], row["error"], row["error"]["stateless"]
     errors = (error["max_255"], error["rms_255"], error["psnr_db"], alone["max_255"], alone["psnr_db"])
     return row["name"], *errors, *(memory.get(name) for name in PASSES)
 

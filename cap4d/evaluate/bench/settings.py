@@ -7,6 +7,7 @@ from pathlib import Path
 
 from cap4d.evaluate.bench.scenes import Scene, SceneSource, gaussian_count
 
+QUICK_SIDE = 128  # px
 SECTIONS = ("ceilings", "splat", "fit", "deformer", "frame", "peers")
 
 
@@ -67,4 +68,5 @@ class Settings:
         return gaussian_count(name) // 100 if self.quick and self.scenes is None else None
 
     def load(self, source: SceneSource, name: str) -> Scene:
-        return source.load(name, count=self.count(name))
+        scene = source.load(name, count=self.count(name))
+        return scene.resized(QUICK_SIDE) if self.quick else scene

@@ -21,6 +21,7 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
 QUAT_MIN = 1e-12
+DEPTH_MAX = 1e7  # m
 COLOR_MAX = 1e6
 
 TILE = 16  # px a side
@@ -100,10 +101,9 @@ def project(gaussians: Gaussians, camera: Camera, *, dtype: type = np.float64) -
     with np.errstate(all="ignore"):  # what is not finite is not drawn
         colors = eval_sh(sh, means - camera.position.astype(dtype))
         view = means @ rotation.T + translation
-        finite = np.isfinite(means).all(1) & np.isfinite(quats).all(1) & np.isfinite(scales).all(1)
-        drawable = (
-            finite & (view[:, 2] >= NEAR) & (opacities >= ALPHA_MIN) & (np.abs(colors) <= COLOR_MAX).all(1)
-        )
+        drawable = np.isfinite(means).all(1) & np.isfinite(quats).all(1) & np.isfinite(scales).all(1)
+        drawable &= (view[:, 2] >= NEAR) & (view[:, 2] <= DEPTH_MAX)
+        drawable &= (opacities >= ALPHA_MIN) & (np.abs(colors) <= COLOR_MAX).all(1)
     ids = np.flatnonzero(drawable)
     means2d, covariance, det = footprints(view[ids], quats[ids], scales[ids], rotation, camera)
     xx, xy, yy = covariance.T
@@ -186,7 +186,9 @@ def tiles(splats: Splats, camera: Camera) -> Iterator[Tile]:
     tile = row * columns + column
     order = np.argsort(tile, kind="stable")  # members stay near to far
     starts = np.flatnonzero(np.diff(tile[order], prepend=-1))
-    for members, number in zip(np.split(member[order], starts[1:]), tile[order][starts], strict=True):
+    ends = [*starts[1:], len(order)][: len(starts)]
+    for start, end in zip(starts, ends, strict=True):
+        members, number = member[order[start:end]], tile[order[start]]
         x0, y0 = TILE * (number % columns), TILE * (number // columns)
         yield Tile(x0, y0, min(TILE, camera.width - x0), min(TILE, camera.height - y0), members)
 
