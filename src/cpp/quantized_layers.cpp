@@ -37,14 +37,19 @@ struct Inputs {
   IntV even, odd;
 };
 typedef std::int16_t ShortV __attribute__((vector_size(4 * kLanes)));
+typedef std::uint16_t UShortV __attribute__((vector_size(4 * kLanes)));
 
 CAP4D_INLINE Weights unpack(IntV w) {
   const ShortV pairs = reinterpret_cast<ShortV>(w);
   return {reinterpret_cast<IntV>((pairs << 8) >> 8), reinterpret_cast<IntV>(pairs >> 8)};
 }
+CAP4D_INLINE Inputs split(IntV all) { return {all & 0x00ff00ff, reinterpret_cast<IntV>(reinterpret_cast<UShortV>(all) >> 8)}; }
 CAP4D_INLINE Inputs spread(std::int32_t four) {
-  const IntV all = four - IntV{};
-  return {all & 0x00ff00ff, (all >> 8) & 0x00ff00ff};
+  IntV all = four - IntV{};
+#ifdef __SSE2__
+  asm("" : "+x"(all));  // GCC would mask the number before it is spread, and so take both halves through general registers
+#endif
+  return split(all);
 }
 CAP4D_INLINE IntV madd(IntV a, IntV b) {
 #if defined(CAP4D_AVX512)
@@ -57,7 +62,7 @@ CAP4D_INLINE IntV madd(IntV a, IntV b) {
   return (a & 0xffff) * ((b << 16) >> 16) + (a >> 16) * (b >> 16);  // a holds no negative numbers
 #endif
 }
-CAP4D_INLINE IntV dot4(IntV sum, const Inputs& a, const Weights& w) { return sum + madd(a.even, w.even) + madd(a.odd, w.odd); }
+CAP4D_INLINE IntV dot4(IntV sum, const Inputs& a, const Weights& w) { return sum + (madd(a.even, w.even) + madd(a.odd, w.odd)); }
 #endif
 
 CAP4D_INLINE IntV load_int(const void* p) {
@@ -176,7 +181,7 @@ void requantize(const RequantizeJob& job) {
 
 // ---- The first layer ----------------------------------------------------------------------------------------------------------------
 
-constexpr int kFirstLines = 2 * kFirstBand + 2;
+constexpr int kFirstLines = 2 * kFirstBand + 2, kFirstStride = kMaxUnetSize + 2;
 #if defined(CAP4D_AVX512)
 constexpr int kFirstPixels = 8;  // at once
 #else
@@ -185,7 +190,7 @@ constexpr int kFirstPixels = 4;
 
 // What a band of output rows reads: [line][axis][x], masked, with a zero on every side.
 struct FirstLines {
-  float value[kFirstLines][3][kMaxUnetSize + 2];
+  float value[kFirstLines][3][kFirstStride];
 };
 
 void fill_lines(const FirstJob& job, FirstLines& lines) {
@@ -218,15 +223,13 @@ CAP4D_INLINE void first_tile(const FirstJob& job, const FirstLines& lines, int r
     for (int v = 0; v < kVectors; ++v)
       sum[p][v] = load(table(job.rows, edge(x + p), y) + v * kLanes) + load(table(job.columns, edge(y), x + p) + v * kLanes);
   const float* weights = job.weights + c;
-  for (int line = 0; line < 4; ++line)
-    for (int axis = 0; axis < 3; ++axis)
-      for (int column = 0; column < 4; ++column, weights += channels) {
-        const float* input = lines.value[2 * row + line][axis] + 2 * x + column;
-        FloatV w[kVectors];
-        for (int v = 0; v < kVectors; ++v) w[v] = load(weights + v * kLanes);
-        for (int p = 0; p < kPixels; ++p)
-          for (int v = 0; v < kVectors; ++v) sum[p][v] = sum[p][v] + w[v] * input[2 * p];
-      }
+  for (int tap = 0; tap < kFirstTaps; ++tap, weights += channels) {
+    const float* input = lines.value[2 * row][0] + tap / 4 * kFirstStride + 2 * x + tap % 4;
+    FloatV w[kVectors];
+    for (int v = 0; v < kVectors; ++v) w[v] = load(weights + v * kLanes);
+    for (int p = 0; p < kPixels; ++p)
+      for (int v = 0; v < kVectors; ++v) sum[p][v] = sum[p][v] + w[v] * input[2 * p];
+  }
   for (int v = 0; v < kVectors; ++v) {
     const int at = c + v * kLanes;
     const Quantum leaky = quantum(job.leaky, at), relu = quantum(job.relu, at);
@@ -281,7 +284,7 @@ CAP4D_INLINE Inputs spread16(const std::uint8_t* p) {
 #if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
   return all;
 #else
-  return {all & 0x00ff00ff, (all >> 8) & 0x00ff00ff};
+  return split(all);
 #endif
 }
 
@@ -323,13 +326,17 @@ void last_tile(const LastJob& job, int x) {
     for (int p = 0; p < kLastPixels; ++p)
       for (int parity = 0; parity < kParities; ++parity) store_int(sums[p][parity] + lane, sum[p][parity]);
   }
-  for (int axis = 0; axis < 3; ++axis)
+  const std::size_t size = job.size;
+  for (int axis = 0; axis < 3; ++axis) {
+    const float scale = job.scale[axis], bias = job.bias[axis];
+    float* out = job.out + (axis * size + 2 * job.row) * size + 2 * x;
     for (int p = 0; p < kLastPixels; ++p)
       for (int parity = 0; parity < kParities; ++parity) {
         const std::int32_t* four = sums[p][parity] + axis * kGroups;
-        const std::size_t y = 2 * job.row + parity / 2, column = 2 * (x + p) + parity % 2;
-        job.out[(axis * job.size + y) * job.size + column] = static_cast<float>((four[0] + four[1]) + (four[2] + four[3])) * job.scale[axis] + job.bias[axis];
+        const std::int32_t sum = (four[0] + four[1]) + (four[2] + four[3]);
+        out[parity / 2 * size + 2 * p + parity % 2] = static_cast<float>(sum) * scale + bias;
       }
+  }
 }
 
 void last(const LastJob& job) {

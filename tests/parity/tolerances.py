@@ -30,7 +30,7 @@ PLAYER_SCALES = 1e-5  # relative
 PLAYER_PICTURE = 1  # steps of 255, on all but one pixel in a thousand
 PLAYER_HALF_DB = 45  # float16 bundle against float32, PSNR of a picture
 
-# The deformation network in 8-bit integers against float32, mm. Random networks that answer 1 mm RMS per axis; trained ones, which
-# are smoother, come five times nearer (bench_deformer).
+# The deformation network in 8-bit integers against float32, mm. Of random networks that answer 1 mm RMS per
+# axis; trained ones come several times nearer (bench_deformer).
 INT8_RMS_MM = 0.08
 INT8_MOST_MM = 0.4
