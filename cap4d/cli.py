@@ -504,7 +504,9 @@ def add_bench(commands) -> None:
         help="avatars for the deformer and whole frames (default: none, and those sections are left out)",
     )
     parser.add_argument(
-        "--only", metavar="SECTIONS", help="some of ceilings,splat,fit,deformer,frame,peers (default: all)"
+        "--only",
+        metavar="SECTIONS",
+        help="some of ceilings,splat,fit,deformer,frame,optimize,peers (default: all)",
     )
     parser.add_argument("--threads", type=int, default=2, metavar="N", help="of everything (default: 2)")
     parser.add_argument("--quick", action="store_true", help="small and short: to see that it runs")

@@ -14,6 +14,7 @@ from cap4d.evaluate.bench.show import (
     deformer_shows,
     fitting_shows,
     frame_shows,
+    shrinking_shows,
     splatting_shows,
     verdict,
 )
@@ -111,6 +112,17 @@ def test_frames_must_be_many_and_even() -> None:
     faster = {**frame("linear", 90, 1.2), "name": "linear, pipelined"}
     shows = list(frame_shows({**avatar, "tiers": [*rows, faster]}))
     assert verdicts(shows) == [True, False, True] and "pipelined" in shows[2].text
+
+
+@pytest.mark.parametrize(
+    ("smaller", "faster", "expected"), [(4.0, 1.5, True), (3.9, 2.0, False), (9, 1.4, False)]
+)
+def test_an_optimised_avatar_must_be_smaller_and_faster(
+    smaller: float, faster: float, expected: bool
+) -> None:
+    rows = [{"name": name, "psnr_db": 45.5} for name in ("full", "small")]
+    found = {"avatar": "me.cap4d", "limit_db": 45, "smaller": smaller, "faster": faster, "rows": rows}
+    assert verdicts(shrinking_shows(found)) == [expected]
 
 
 def test_a_verdict_counts_what_can_be_judged() -> None:

@@ -47,7 +47,7 @@ def measure_frames(path: Path, settings: Settings) -> dict[str, Any]:
     truths = [true_picture(pose_of(first, frame), camera) for frame in samples]
     for avatar in tiers.values():
         avatar.stages.clear()
-    seconds = time_blocks({tier: _player(avatar, camera) for tier, avatar in tiers.items()}, settings.frames)
+    seconds = time_blocks({tier: playing(avatar, camera) for tier, avatar in tiers.items()}, settings.frames)
     rows = []
     for tier, avatar in tiers.items():
         timing = Timing(tuple(seconds[tier]))
@@ -138,7 +138,7 @@ def memory_alone(*, path: str, tier: str, threads: int, frames: int) -> dict[str
     MB.
     """
     avatar = Avatar.load(path, deformer=tier, threads=threads)
-    player = _player(avatar, avatar.camera.resized(SIDE, SIDE))
+    player = playing(avatar, avatar.camera.resized(SIDE, SIDE))
     for _ in range(5):
         next(player)
     early = peak_memory_mb()
@@ -147,7 +147,7 @@ def memory_alone(*, path: str, tier: str, threads: int, frames: int) -> dict[str
     return {"memory_mb": round(peak_memory_mb(), 1), "memory_grown_mb": round(peak_memory_mb() - early, 1)}
 
 
-def _player(avatar: Avatar, camera: Camera) -> Iterator[np.ndarray]:
+def playing(avatar: Avatar, camera: Camera) -> Iterator[np.ndarray]:
     """The idle clip for ever, through the same loop that writes videos."""
     return render_clip(avatar, avatar.idle, lambda index, frame: camera, frames=1 << 30)
 
@@ -177,7 +177,7 @@ def _configurations(
     avatars = {plan: _with_sh_degree(tiers[plan[0]], plan[1]) for plan in plans}
     views = {plan: camera.resized(plan[2], plan[2]) for plan in plans}
     seconds = time_blocks(
-        {str(plan): _player(avatars[plan], views[plan]) for plan in plans}, settings.short_runs
+        {str(plan): playing(avatars[plan], views[plan]) for plan in plans}, settings.short_runs
     )
     return [
         {

@@ -37,6 +37,7 @@ def markdown(report: Report, plots: Sequence[str]) -> str:
         "fit": sections.fit,
         "deformer": sections.deformer,
         "frame": sections.frame,
+        "optimize": sections.optimize,
         "peers": sections.peers,
     }
     lines = ["# Speed against error", ""]

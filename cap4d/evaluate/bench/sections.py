@@ -186,6 +186,17 @@ def frame(avatars: list[Report]) -> Iterator[str]:
         )
 
 
+def optimize(found: Report) -> Iterator[str]:
+    yield from (f"## `cap4d optimize` of {found['avatar']} at {found['limit_db']:.0f} dB", "")
+    columns = ("bytes", "tier", "gaussians", "median_ms", "p95_ms", "psnr_db")
+    head = ("avatar", "bytes", "tier", "Gaussians", "frame, median", "p95", "PSNR, dB")
+    yield from table(head, ((row["name"], *(row[name] for name in columns)) for row in found["rows"]))
+    yield from table(
+        ("after the step", "bytes", "PSNR, dB"),
+        ((s["name"], s["bytes"], s["psnr_db"]) for s in found["steps"]),
+    )
+
+
 def peers(found: Report) -> Iterator[str]:
     yield from ("## Peers", "")
     yield "In the same process, in turns with ours. gsplat's functions are given the list of blended pairs."

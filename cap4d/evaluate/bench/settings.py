@@ -8,7 +8,7 @@ from pathlib import Path
 from cap4d.evaluate.bench.scenes import Scene, SceneSource, gaussian_count
 
 QUICK_SIDE = 128  # px
-SECTIONS = ("ceilings", "splat", "fit", "deformer", "frame", "peers")
+SECTIONS = ("ceilings", "splat", "fit", "deformer", "frame", "optimize", "peers")
 
 
 @dataclass(frozen=True)

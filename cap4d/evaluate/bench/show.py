@@ -18,6 +18,7 @@ MAX_ERROR_255, MIN_PSNR_DB = 1.0, 50.0
 INT8_SPEED_UP = 2.5
 FPS = {"full": 25.0, "int8": 45.0, "linear": 80.0}
 P99_OVER_MEDIAN = 2.0
+SMALLER, FASTER = 4.0, 1.5
 SCATTER = 1.03  # two measurements of the same thing
 LINEAR_FREE_MS = 0.1  # of a frame: the scatter of two equal measurements
 
@@ -157,6 +158,18 @@ def frame_shows(avatar: dict[str, Any]) -> Iterator[Show]:
                 f"{row['p99_over_median']:.2f} x median (asked {P99_OVER_MEDIAN:.0f})",
                 row["fps"] >= wanted and row["p99_over_median"] <= P99_OVER_MEDIAN,
             )
+
+
+def shrinking_shows(found: dict[str, Any]) -> Iterator[Show]:
+    """How much smaller and faster `cap4d optimize` makes an avatar."""
+    small = found["rows"][1]
+    yield Show(
+        4,
+        f"{found['avatar']} at {found['limit_db']:.0f} dB: {found['smaller']:.2f} times smaller (asked "
+        f"{SMALLER:.0f}), frames {found['faster']:.2f} times as fast (asked {FASTER}), pixels at "
+        f"{small['psnr_db']:.1f} dB",
+        found["smaller"] >= SMALLER and found["faster"] >= FASTER,
+    )
 
 
 def work_of(row: dict[str, Any]) -> Work:

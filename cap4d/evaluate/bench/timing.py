@@ -46,6 +46,8 @@ def measure(
 ) -> dict[str, Timing]:
     """Times several calls, one run of each in turn, so that whatever else the machine does hits all alike.
 
+    Each round has an order of its own: what a call leaves in the caches helps or hurts all others alike.
+
     Args:
         calls: By name.
         runs: Of each call that count.
@@ -56,12 +58,14 @@ def measure(
     for call in calls.values():
         for _ in range(warm_up):
             call()
+    shuffle, names = np.random.default_rng(0), list(calls)
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     was_enabled = gc.isenabled()
     gc.disable()
     try:
         for _ in range(runs):
-            for name, call in calls.items():
+            for name in shuffle.permutation(names):
+                call = calls[name]
                 time.sleep(rest_s)
                 start = clock()
                 call()
