@@ -62,22 +62,23 @@ double one_go(int threads, const std::function<void(int)>& work) {
   return seconds_between(*std::min_element(starts.begin(), starts.end()), *std::max_element(ends.begin(), ends.end()));
 }
 
-// `work(thread, rounds)` does `amount` a round and thread. The number of rounds grows until a go takes a few milliseconds, long
-// beside the start of a thread; then the best of many goes counts.
+// `work(thread, rounds)` does `amount` a round and thread. The number of rounds grows until even the quickest of a few goes takes some
+// milliseconds, long beside the start of a thread; then the best of many goes counts.
 double best_rate(double amount, int threads, double seconds, const std::function<void(int, std::size_t)>& work) {
   constexpr double kGo = 4e-3;
+  constexpr int kTries = 3;  // on a busy machine a single go can take long for other reasons
   std::size_t rounds = 1;
   const auto go = [&] { return one_go(threads, [&](int thread) { work(thread, rounds); }); };
-  double best = 0;
+  const auto quickest = [&] {
+    double least = go();
+    for (int i = 1; i < kTries; ++i) least = std::min(least, go());
+    return least;
+  };
   const Clock::time_point start = Clock::now();
-  do {
-    const double taken = go();
-    if (taken >= kGo || best > 0)
-      best = std::max(best, amount * threads * rounds / taken);
-    else
-      rounds *= 2;
-  } while (best == 0 || seconds_between(start, Clock::now()) < seconds);
-  return best;
+  double least = quickest();
+  for (; least < kGo; least = quickest()) rounds *= 2;
+  while (seconds_between(start, Clock::now()) < seconds) least = std::min(least, go());
+  return amount * threads * rounds / least;
 }
 
 constexpr std::size_t kPiece = 4096;  // bytes: buffers are a multiple of it

@@ -14,6 +14,7 @@ from cap4d.bundle import write_bundle
 from cap4d.errors import ArgumentError
 from cap4d.evaluate.bench import peers
 from cap4d.evaluate.bench.child import ChildError, in_child
+from cap4d.evaluate.bench.fitting import FUSED, OURS, TORCH
 from cap4d.evaluate.bench.plots import draw_plots
 from cap4d.evaluate.bench.run import parse_sections, try_plots
 from cap4d.evaluate.bench.scenes import SceneSource
@@ -75,6 +76,13 @@ def test_the_numbers_of_the_splatter_hang_together(report: Path) -> None:
     assert splat["scaling"]["isa"][0]["isa"] == "base" and splat["scaling"]["isa"][-1]["isa"] == splat["isa"]
     for entry in splat["roofline"]:
         assert entry["floor_ms"] == pytest.approx(sum(s["ms"] for s in entry["stages"]), abs=2e-3)
+
+
+def test_all_steps_of_adam_are_the_same(report: Path) -> None:
+    fit = json.loads((report / "out" / "report.json").read_text())["fit"]
+    assert fit["values"] == 1_000 * 59
+    assert [step["name"] for step in fit["steps"]] == [OURS, TORCH, FUSED]
+    assert all(step["difference"] < 1e-6 for step in fit["steps"])
 
 
 def test_the_avatar_is_measured_in_each_of_its_tiers(report: Path) -> None:

@@ -136,8 +136,8 @@ def fit(found: Report) -> Iterator[str]:
     yield f"Adam on {found['gaussians']:,} Gaussians x {found['values'] // found['gaussians']} float32;"
     yield f"floor (every value, gradient and moment moved once): {found['floor_ms']:.2f} ms."
     yield ""
-    rows = ((s["name"], s["median_ms"], s["p95_ms"], s.get("error")) for s in found["steps"])
-    yield from table(("step", "median", "p95", "largest difference after 10 steps"), rows)
+    rows = ((s["name"], s["median_ms"], s["p95_ms"], s["difference"]) for s in found["steps"])
+    yield from table(("step", "median", "p95", "largest difference from torch after 10 steps"), rows)
 
 
 def deformer(avatars: list[Report]) -> Iterator[str]:
