@@ -115,13 +115,15 @@ class _Road:
 
     def _take(self, name: str, step: Callable[[Candidate], Candidate], limit: float) -> None:
         """Takes a step, unless it changes nothing or goes beyond the limit."""
-        log.info("%s ...", name)
         before, after = self.candidate, step(self.candidate)
         detail = change(before, after)
         error = self.judge.error(after)
         if detail and error.pooled <= limit:
             self.candidate = after
             self.steps.append(Step(name, detail, after.size(), error.psnr, error.worst))
+            log.info("%s: %s; %.2f MB, %.2f dB", name, detail, self.steps[-1].size / 1e6, error.psnr)
+        else:
+            log.info("%s: nothing", name)
 
     def _cheapest_tier(self, candidate: Candidate, limit: float) -> Candidate:
         return cheapest_tier(
