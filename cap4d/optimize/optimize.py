@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from cap4d.atomic import replacing
 from cap4d.bundle.reader import read_bundle
 from cap4d.capture.capture import Capture
@@ -58,7 +56,6 @@ def optimize(
         raise ArgumentError("optimize: expected one of --max-error and --max-size")
     if output.exists() and path.exists() and output.samefile(path):
         raise ArgumentError(f"{output}: expected another file than the avatar itself")
-    torch.set_num_threads(1)  # ours does the work, on threads of its own; torch's would wait for each other
     bundle = read_bundle(path)
     captured = None if capture is None else Capture.load(capture)
     with replacing(output) as temporary:
@@ -67,7 +64,6 @@ def optimize(
             road.go(max_error_db)
         else:
             road.go_until(max_bytes)
-        temporary.unlink()
         road.candidate.write(temporary)
     return Report(tuple(road.steps), road.judge.error_beyond(road.candidate).psnr)
 

@@ -23,6 +23,7 @@ COMMANDS = (
     ["rig", "show"],
     ["track"],
     ["fit"],
+    ["optimize"],
     ["render"],
     ["inspect"],
 )

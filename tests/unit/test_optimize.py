@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 from quantized_reference import random_network
-from tiny_bundle import RIG_NAME, tiny_bundle
+from tiny_bundle import RIG_NAME, tiny_bundle, tiny_mesh
 
 from cap4d.avatar.views import held_out_frames
 from cap4d.bundle import Bundle, read_bundle
@@ -115,6 +115,23 @@ def test_the_stored_candidate_is_what_comes_back_from_its_file(full: Candidate, 
         assert np.array_equal(getattr(back, name), getattr(stored, name)), name
     assert np.array_equal(back.subject.expression_basis, stored.subject.expression_basis)
     assert (back.deform_onnx, back.deform_int8) == (None, None) and back.tiers == ("linear", "off")
+
+
+def test_a_head_on_its_mesh_is_changed_there(tmp_path: Path) -> None:
+    """As FLAME's, whose mesh has fewer points than the grid."""
+    bundle, mesh = small(network=False), tiny_mesh(6)
+    vertices = np.random.default_rng(1).integers(36, size=bundle.grid.vertices.shape).astype(np.int32)
+    grid = replace(bundle.grid, vertices=vertices)
+    subject = mesh.resample(grid.vertices, grid.bary)
+    bundle = replace(bundle, grid=grid, subject=subject, mesh_subject=mesh, rig_vertices=0)
+    candidate = Candidate(
+        without_unused(bundle), "off", {"expression_basis": "int8", "pose_basis": "float16"}
+    )
+    candidate.write(tmp_path / "a.cap4d")
+    back, stored = read_bundle(tmp_path / "a.cap4d"), candidate.stored()
+    assert len(back.mesh_subject.neutral) == 36 and back.subject.pose_offset is None
+    for name in ("neutral", "expression_basis", "pose_basis"):
+        assert np.array_equal(getattr(back.subject, name), getattr(stored.subject, name)), name
 
 
 def with_cheaper(bundle: Bundle) -> Bundle:
