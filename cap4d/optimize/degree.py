@@ -10,6 +10,7 @@ import torch
 from cap4d.bundle.bundle import Bundle
 from cap4d.optimize.removal import blending_weights
 from cap4d.optimize.scene import Scene, tensors
+from cap4d.optimize.threads import one_torch_thread
 from cap4d.raster.reference import sh_basis
 
 RIDGE = 0.05
@@ -17,6 +18,7 @@ RIDGE = 0.05
 one side only keeps its colour from the others."""
 
 
+@one_torch_thread()
 def at_degree(bundle: Bundle, scene: Scene, degree: int) -> Bundle:
     """The bundle with spherical harmonics up to `degree`.
 

@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from cap4d.atomic import replacing
 from cap4d.bundle.reader import read_bundle
 from cap4d.capture.capture import Capture
@@ -58,7 +56,6 @@ def optimize(
         raise ArgumentError("optimize: expected one of --max-error and --max-size")
     if output.exists() and path.exists() and output.samefile(path):
         raise ArgumentError(f"{output}: expected another file than the avatar itself")
-    torch.set_num_threads(1)  # ours does the work, on threads of its own; torch's would wait for each other
     bundle = read_bundle(path)
     captured = None if capture is None else Capture.load(capture)
     with replacing(output) as temporary:
@@ -67,7 +64,6 @@ def optimize(
             road.go(max_error_db)
         else:
             road.go_until(max_bytes)
-        temporary.unlink()
         road.candidate.write(temporary)
     return Report(tuple(road.steps), road.judge.error_beyond(road.candidate).psnr)
 
@@ -115,13 +111,15 @@ class _Road:
 
     def _take(self, name: str, step: Callable[[Candidate], Candidate], limit: float) -> None:
         """Takes a step, unless it changes nothing or goes beyond the limit."""
-        log.info("%s ...", name)
         before, after = self.candidate, step(self.candidate)
         detail = change(before, after)
         error = self.judge.error(after)
         if detail and error.pooled <= limit:
             self.candidate = after
             self.steps.append(Step(name, detail, after.size(), error.psnr, error.worst))
+            log.info("%s: %s; %.2f MB, %.2f dB", name, detail, self.steps[-1].size / 1e6, error.psnr)
+        else:
+            log.info("%s: nothing", name)
 
     def _cheapest_tier(self, candidate: Candidate, limit: float) -> Candidate:
         return cheapest_tier(

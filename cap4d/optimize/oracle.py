@@ -18,6 +18,7 @@ from cap4d.camera import opencv_from_rig
 from cap4d.drive.clip import Frame
 from cap4d.gaussians import SH_COUNTS
 from cap4d.optimize.shots import Shot
+from cap4d.optimize.threads import one_torch_thread
 from cap4d.player.tiers import choose_tier, moving_subject
 from cap4d.raster.reference import rasterize_reference
 from cap4d.track.progress import progress
@@ -33,6 +34,7 @@ class Picture:
     alpha: np.ndarray
 
 
+@one_torch_thread()
 def exact_pictures(bundle: Bundle, shots: Sequence[Shot], label: str) -> list[Picture]:
     """The float64 pictures of an avatar with its most exact deformer; 2 s each at 90,000 Gaussians.
 

@@ -16,7 +16,7 @@ from cap4d.optimize.removal import removal_errors
 from cap4d.optimize.unused import without_bare_faces
 
 AT_ONCE = 0.08  # of the Gaussians, in a round
-LEAST = 0.01
+LEAST = 0.03  # what is not worth a round
 REFINE_STEPS = 48
 ROUNDS = 60
 

@@ -9,6 +9,7 @@ import torch
 
 from cap4d.bundle.bundle import Bundle
 from cap4d.optimize.scene import FIELDS, Scene, tensors
+from cap4d.optimize.threads import one_torch_thread
 from cap4d.raster import rasterize
 
 RATES = {"means": 9e-3, "quats": 3.6e-3, "log_scales": 9e-3, "opacity_logits": 3.6e-2, "sh": 4.5e-3}
@@ -19,6 +20,7 @@ alike (a pruned talking head gains 3.7 dB in 48 steps so, 2.3 at best without)."
 STRIDE = 7  # shots are taken in steps of it, so that neighbours in time do not follow each other
 
 
+@one_torch_thread()
 def refined(bundle: Bundle, scene: Scene, *, steps: int) -> Bundle:
     """The bundle with Gaussians a little nearer to the scene's pictures.
 

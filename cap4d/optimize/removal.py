@@ -14,12 +14,14 @@ from cap4d import _core
 from cap4d.bundle.bundle import Bundle
 from cap4d.gaussians import SH_COUNTS
 from cap4d.optimize.scene import Scene, tensors
+from cap4d.optimize.threads import one_torch_thread
 
 HIGHEST = np.float32(0.98)  # opacities are kept below the clamp, above which the gradient is 0
 BACKGROUNDS = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 Y00 = 0.28209479177387814
 
 
+@one_torch_thread()
 def removal_errors(bundle: Bundle, scene: Scene, *, seed: int) -> np.ndarray:
     """float64[N]: the mean squared error of the scene's pictures that each Gaussian's removal alone would
     make.

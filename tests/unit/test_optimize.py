@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 from quantized_reference import random_network
-from tiny_bundle import tiny_bundle
+from tiny_bundle import RIG_NAME, tiny_bundle, tiny_mesh
 
+from cap4d.avatar.views import held_out_frames
 from cap4d.bundle import Bundle, read_bundle
 from cap4d.bundle.schema import MANIFEST
+from cap4d.capture.capture import Capture, View
 from cap4d.errors import ArgumentError
 from cap4d.optimize.candidate import Candidate, with_gaussians
 from cap4d.optimize.degree import at_degree
@@ -68,6 +71,34 @@ def test_no_shot_is_both_learned_from_and_measured(full: Candidate) -> None:
     )  # the default one and eight around it
 
 
+def a_capture(bundle: Bundle, *, rig_name: str = RIG_NAME) -> Capture:
+    """A film of the idle clip, in memory; the head's pose is in the camera."""
+    clip = long_clip(bundle)
+    count, zeros = len(clip), np.zeros((len(clip), 3), np.float32)
+    poses = {"rot": zeros, "tra": zeros, "eye_rot": clip.eye_rot, "neck_rot": clip.neck_rot, "jaw_rot": zeros}
+    return Capture(
+        path=Path("capture"),
+        rig_name=rig_name,
+        shape=np.zeros(1, np.float32),
+        expr=clip.expr,
+        **poses,
+        cameras={"cam": bundle.camera.resized(1024, 1024)},
+        fps=24.0,
+        views=tuple(View("cam", t, Path(f"{t}.png"), None) for t in range(count)),
+    )
+
+
+def test_training_views_of_a_capture_are_looked_at_too(full: Candidate) -> None:
+    avatar, capture = Avatar(full.bundle, deformer="off"), a_capture(full.bundle)
+    shots = choose_shots(avatar, capture)
+    assert (len(shots.learned), len(shots.measured)) == (48, 32)
+    seen = {round(s.frame.t * capture.fps) for s in (*shots.learned[24:], *shots.measured[16:])}
+    assert not seen & set(np.flatnonzero(held_out_frames(capture)).tolist())
+    assert {s.camera.width for s in shots.measured[16:]} == {512}
+    with pytest.raises(ArgumentError, match="rig: expected"):
+        choose_shots(avatar, a_capture(full.bundle, rig_name="other"))
+
+
 def long_clip(bundle: Bundle):
     """The idle clip, eight times over."""
     names = ("expr", "eye_rot", "neck_rot", "jaw_rot")
@@ -86,9 +117,26 @@ def test_the_stored_candidate_is_what_comes_back_from_its_file(full: Candidate, 
     assert (back.deform_onnx, back.deform_int8) == (None, None) and back.tiers == ("linear", "off")
 
 
+def test_a_head_on_its_mesh_is_changed_there(tmp_path: Path) -> None:
+    """As FLAME's, whose mesh has fewer points than the grid."""
+    bundle, mesh = small(network=False), tiny_mesh(6)
+    vertices = np.random.default_rng(1).integers(36, size=bundle.grid.vertices.shape).astype(np.int32)
+    grid = replace(bundle.grid, vertices=vertices)
+    subject = mesh.resample(grid.vertices, grid.bary)
+    bundle = replace(bundle, grid=grid, subject=subject, mesh_subject=mesh, rig_vertices=0)
+    candidate = Candidate(
+        without_unused(bundle), "off", {"expression_basis": "int8", "pose_basis": "float16"}
+    )
+    candidate.write(tmp_path / "a.cap4d")
+    back, stored = read_bundle(tmp_path / "a.cap4d"), candidate.stored()
+    assert len(back.mesh_subject.neutral) == 36 and back.subject.pose_offset is None
+    for name in ("neutral", "expression_basis", "pose_basis"):
+        assert np.array_equal(getattr(back.subject, name), getattr(stored.subject, name)), name
+
+
 def with_cheaper(bundle: Bundle) -> Bundle:
     """With a line per expression that is nearly right, and a whole-number network that is not."""
-    bundle = with_cheaper_tiers(replace(bundle, deform_int8=random_network(8, 1)))
+    bundle = replace(with_cheaper_tiers(bundle), deform_int8=random_network(8, 1))
     assert bundle.deform_linear is not None
     return bundle
 
