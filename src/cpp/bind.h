@@ -18,7 +18,7 @@ struct BoundGaussians {
 void bind(const float* vertices, const BoundGaussians& bound, int threads, float* means, float* quats, float* scales);
 
 // The VJP of `bind`: from gradients of its outputs to those of vertices [G, 3], means, quats and log_scales, all overwritten.
-// A triangle without area passes on what moves its centre and nothing else.
+// A triangle without area passes on what moves its centre and nothing else; a Gaussian whose pose is not finite passes on nothing.
 struct BindGradients {
   const float *v_means, *v_quats, *v_scales;                    // in
   float *v_vertices, *v_local_means, *v_local_quats, *v_log_scales;  // out

@@ -20,7 +20,7 @@ inline constexpr float kTransmittanceMin = 1e-4f;
 // A quaternion whose largest component is below this has no direction: no rotation, and no gradient.
 inline constexpr float kQuatMin = 1e-12f;
 // Guard of every division by a length in the triangle frames (GaussianAvatars; fact 27).
-inline constexpr float kSafeNorm2 = 1e-20f;
+inline constexpr double kSafeNorm2 = 1e-20;
 // A Gaussian with a colour beyond this is bad data and not drawn: sums and gradients of what is drawn cannot overflow.
 inline constexpr float kColorMax = 1e6f;
 // A Gaussian farther than this is bad data too, m: squares of its depth and of what divides by it stay in float32.
@@ -28,11 +28,11 @@ inline constexpr float kDepthMax = 1e7f;
 // How far out, in standard deviations, the radius that densification prunes by reaches (3DGS).
 inline constexpr float kRadiusSigmas = 3.0f;
 
-inline constexpr int kTileLog2 = 4;
-inline constexpr int kTile = 1 << kTileLog2;  // px a side; the unit of work of a thread and of binning
 // Cameras take their numbers from the nearest point of a grid this wide, m: a head's own camera from the origin, which costs no digit.
 inline constexpr double kPivotStep = 16.0;
 
+inline constexpr int kTileLog2 = 4;
+inline constexpr int kTile = 1 << kTileLog2;  // px a side; the unit of work of a thread and of binning
 inline constexpr int kMaxSide = 16384;       // px; larger images are refused
 
 inline constexpr double kPi = 3.14159265358979323846;
