@@ -54,10 +54,11 @@ void sort_pairs(std::uint32_t* keys, std::uint32_t* values, std::uint32_t* key_s
 
 void sort_by_depth(const float* means, std::size_t count, const float* viewmat, std::uint32_t* order, int threads) {
   auto keys = make_buffer<std::uint32_t>(count), scratch = make_buffer<std::uint32_t>(2 * count);
-  const float *forward = viewmat + 8, offset = viewmat[11];
+  const double forward[3] = {viewmat[8], viewmat[9], viewmat[10]}, offset = viewmat[11];
   parallel_for(count, kGrain, threads, [&](std::size_t begin, std::size_t end) {
     for (std::size_t i = begin; i < end; ++i) {
-      const float depth = forward[0] * means[3 * i] + forward[1] * means[3 * i + 1] + forward[2] * means[3 * i + 2] + offset;
+      // In double: far from the origin the sum cancels.
+      const auto depth = static_cast<float>(forward[0] * means[3 * i] + forward[1] * means[3 * i + 1] + forward[2] * means[3 * i + 2] + offset);
       keys[i] = std::isfinite(depth) ? ordered_bits(depth) : 0xffffffffu;
       order[i] = static_cast<std::uint32_t>(i);
     }
