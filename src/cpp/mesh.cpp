@@ -36,17 +36,17 @@ void rasterize_mesh(std::span<const double> xyz, std::span<const std::int32_t> f
     const Point a = at(faces[3 * f]), b = at(faces[3 * f + 1]), c = at(faces[3 * f + 2]);
     if (!finite(a) || !finite(b) || !finite(c)) continue;
     const double area = edge(a, b, c.x, c.y);  // positive: clockwise as seen with y down
-    if (area == 0.0 || (cull == Cull::kClockwise && area > 0) || (cull == Cull::kCounterClockwise && area < 0)) continue;
+    if (!std::isfinite(area) || area == 0.0 || (cull == Cull::kClockwise && area > 0) || (cull == Cull::kCounterClockwise && area < 0)) continue;
     const auto [x0, x1] = pixel_range(std::min({a.x, b.x, c.x}), std::max({a.x, b.x, c.x}), width);
     const auto [y0, y1] = pixel_range(std::min({a.y, b.y, c.y}), std::max({a.y, b.y, c.y}), height);
     for (int y = y0; y < y1; ++y) {
       for (int x = x0; x < x1; ++x) {
         const double px = x + 0.5, py = y + 0.5;
         const double u = edge(b, c, px, py) / area, v = edge(c, a, px, py) / area, w = edge(a, b, px, py) / area;
-        if (u < 0 || v < 0 || w < 0) continue;
+        if (!(u >= 0 && v >= 0 && w >= 0)) continue;  // not a number where an edge function overflowed
         const double z = u * a.z + v * b.z + w * c.z;
         const std::size_t i = static_cast<std::size_t>(y) * width + x;
-        if (z >= depth[i]) continue;
+        if (!(z < depth[i])) continue;
         depth[i] = z;
         face[i] = static_cast<std::int32_t>(f);
         bary[3 * i] = u, bary[3 * i + 1] = v, bary[3 * i + 2] = w;

@@ -10,7 +10,7 @@ enum class Cull { kNone, kClockwise, kCounterClockwise };  // orientation in the
 // Rasterises triangles whose vertices are given in pixels (pixel centres at .5) with a depth (smaller is nearer).
 //   xyz   [V, 3] x px, y px, depth; faces [F, 3] indices < V (checked by the caller)
 //   face  [H, W] out: triangle index, or -1; bary [H, W, 3] out: barycentrics, linear in the image
-// A triangle with a non-finite vertex or no area is skipped. Equal depths: the smaller index wins.
+// A triangle with a non-finite vertex, no area or more than float64 holds is skipped. Equal depths: the smaller index wins.
 void rasterize_mesh(std::span<const double> xyz, std::span<const std::int32_t> faces, int height, int width, Cull cull,
                     std::int32_t* face, double* bary);
 
