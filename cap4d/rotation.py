@@ -74,6 +74,8 @@ def identity_like(matrix: Array) -> Array:
 def quat_to_rotmat(quat: Array) -> Array:
     """[..., 4] wxyz, any non-zero norm -> [..., 3, 3]. A zero quaternion gives the identity."""
     xp = namespace(quat)
+    largest = xp.amax(abs(quat), -1)[..., None]
+    quat = quat / xp.where(largest > 0, largest, xp.ones_like(largest))  # its square may not be a number
     norm2 = (quat * quat).sum(-1)
     s = 2 / xp.where(norm2 > 0, norm2, xp.ones_like(norm2))
     w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
