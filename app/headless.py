@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ def play_headless(path: Path, options: Options) -> None:
         ArgumentError, DataError: See `cap4d.player.offline.render_to`.
         GlUnavailableError: `--backend gl` without OpenGL 4.1.
     """
-    avatar = Avatar.load(path, deformer=options.deformer)
+    avatar = Avatar.load(path, deformer=options.deformer, deformer_budget_ms=math.inf)
     clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
     backend, draw = choose_backend(options.backend, avatar)
     out = options.out or f"{path.stem}.mp4"

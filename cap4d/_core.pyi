@@ -1,6 +1,7 @@
 """The C++ extension. Arrays must have the dtype named here and be C-contiguous: nothing is converted."""
 
-from typing import Literal, final
+from collections.abc import Mapping
+from typing import ClassVar, Literal, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,109 @@ def rasterize_vjp(
     threads: int = 0,
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
     """Gradients of means, quats, scales, opacities, sh and means2d."""
+
+@final
+class QuantizedUnet:
+    """The deformation network in 8-bit integers (`bundle.quantized_unet` has the tensors' meaning).
+
+    The same bits for any thread count and on every instruction set. Calls from several threads wait for each
+    other.
+    """
+
+    isa: ClassVar[Literal["base", "v3", "v4", "vnni"]]
+    """The variant of the inner loops in use."""
+
+    def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:
+        """For a grid of `size` px. ValueError: a tensor is missing, or of a wrong dtype or shape."""
+    @property
+    def size(self) -> int: ...
+    def run(self, offsets: _F32, threads: int = 0) -> _F32:
+        """offsets [3, S, S] m -> deformation [3, S, S] m. ValueError: a number is not finite."""
+
+@final
+class Splatter:
+    """N Gaussians prepared for drawing again and again, with half-precision colours.
+
+    Activated Gaussians as of `render`; with `binding` [N] they stand in the frames of `faces` [M, 3].
+    """
+
+    def __init__(
+        self,
+        means: _F32,
+        quats: _F32,
+        scales: _F32,
+        opacities: _F32,
+        sh: _F32,
+        binding: _I32 | None = None,
+        faces: _I32 | None = None,
+    ) -> None: ...
+    def draw(
+        self,
+        out: NDArray[np.uint8],
+        viewmat: _F64,
+        K: _F64,
+        background: tuple[float, ...] | None = None,
+        vertices: _F32 | None = None,
+        threads: int = 0,
+    ) -> None:
+        """Into out uint8[H, W, 4]: on a background with alpha 255, or without one with straight alpha."""
+    def render(
+        self,
+        viewmat: _F64,
+        K: _F64,
+        width: int,
+        height: int,
+        background: tuple[float, ...] | None = None,
+        vertices: _F32 | None = None,
+        threads: int = 0,
+    ) -> tuple[_F32, _F32, _F32]:
+        """The picture as `_core.render` gives it."""
+    def order(self, viewmat: _F64, vertices: _F32 | None = None, threads: int = 0) -> NDArray[np.uint32]:
+        """[N] near to far; equal depths keep their order, non-finite ones come last."""
+    def __len__(self) -> int: ...
+    @property
+    def drawn(self) -> int:
+        """Gaussians that met the last picture."""
+    @property
+    def pairs(self) -> int:
+        """Tile-Gaussian pairs of the last picture."""
+    @property
+    def bytes(self) -> int:
+        """Memory held."""
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Of the last picture: bind, project, sort, tiles, rasterize."""
+
+@final
+class GridSurface:
+    """The head on the grid's G vertices: basis [K, G, 3] (expressions, pose correctives), skin_weights [J, G]."""
+
+    def __init__(
+        self,
+        neutral: _F32,
+        basis: _F32,
+        skin_weights: _F32,
+        pixels: _I32,
+        size: int,
+        deformable: NDArray[np.bool_],
+        deform_neutral: _F32,
+    ) -> None: ...
+    def pose(
+        self,
+        vertices: _F32,
+        offsets: _F32 | None,
+        coefficients: _F32,
+        late: _F32,
+        turns: list[tuple[int, bool, _F32, _F32]],
+        rest: _F32 | None,
+        threads: int = 0,
+    ) -> None:
+        """Writes vertices [G, 3] and the network's offsets [3, S, S] (from rest [G, 3]); see grid_surface.h.
+
+        turns: (joint, late, R - I [3, 3], pivot [3]); what is late does not show in the offsets.
+        """
+    def deform(self, vertices: _F32, answer: _F32 | None, threads: int = 0) -> None:
+        """Adds the network's answer [3, S, S] where deformable, else the neutral correction."""
 
 def isa() -> Literal["base", "v3", "v4"]:
     """The x86-64 level of the inner loops in use (CAP4D_ISA asks for a lower one)."""

@@ -380,6 +380,13 @@ def add_render(commands) -> None:
     parser.add_argument(
         "--camera", default="static", metavar="static|orbit|FILE", help="camera path (default: static)"
     )
+    parser.add_argument(
+        "--deformer",
+        default="auto",
+        choices=("auto", "full", "fp16", "int8", "linear", "off"),
+        help="how the deformation network is evaluated, as far as the avatar has it (cap4d inspect); auto: "
+        "the most exact (default: auto)",
+    )
     parser.add_argument("--size", default="512x512", metavar="WxH", help="picture (default: 512x512)")
     parser.add_argument("--frames", type=int, metavar="N", help="how many (default: the whole clip, once)")
     parser.add_argument(
@@ -402,6 +409,7 @@ def run_render(arguments: argparse.Namespace) -> None:
         size=arguments.size,
         frames=arguments.frames,
         stats=arguments.stats,
+        deformer=arguments.deformer,
     )
 
 

@@ -15,13 +15,15 @@ from cap4d.bundle.schema import (
     AXES,
     COUNTS,
     FORMAT,
+    INT8,
     MANIFEST,
     MAX_ENTRY_BYTES,
     MAX_GRID_VALUES,
-    ONNX,
+    OPTIONAL_ENTRIES,
     PRECISIONS,
     REQUIRED_ENTRIES,
     RIG_AXES,
+    TIERS,
     UNITS,
     VERSION,
 )
@@ -32,14 +34,20 @@ from cap4d.rig.head import JOINT_DRIVERS
 
 MAX_NAME = 64  # characters of rig, licence and expression names
 MAX_PIXELS = 16384  # of a camera's side
+MAX_ERROR_MM = 1e4
 POINTS = ("grid", "mesh")
 """Whether the rig's tensors stand on the grid's vertices, or on the rig's, for the reader to mix."""
 
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """The manifest's content; `entries` maps names to (size in bytes, sha256 in hex)."""
+    """The manifest's content.
 
+    `entries` maps names to (size in bytes, sha256 in hex), `tier_errors` a deformer's tiers to how far off
+    they are: (RMS, largest), mm.
+    """
+
+    version: int
     precision: str
     rig_name: str
     rig_licence: str
@@ -51,6 +59,7 @@ class Manifest:
     camera: Camera
     idle_fps: float
     entries: dict[str, tuple[int, str]]
+    tier_errors: dict[str, tuple[float, float]]
 
     def to_json(self) -> bytes:
         """The same manifest gives the same bytes."""
@@ -62,7 +71,7 @@ class Manifest:
         camera = self.camera
         document = {
             "format": FORMAT,
-            "version": VERSION,
+            "version": self.version,
             "precision": self.precision,
             "axes": AXES,
             "units": UNITS,
@@ -87,6 +96,11 @@ class Manifest:
                 for name, (size, digest) in sorted(self.entries.items())
             },
         }
+        if self.tier_errors:
+            document["deformer"] = {
+                tier: {"rms_mm": rms, "max_mm": worst}
+                for tier, (rms, worst) in sorted(self.tier_errors.items())
+            }
         return (json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True) + "\n").encode()
 
     @staticmethod
@@ -112,6 +126,7 @@ class Manifest:
         names, ranges = _expressions(rig, counts["expressions"])
         idle = fields.group("idle")
         manifest = Manifest(
+            version=version,
             precision=fields.choice("precision", PRECISIONS),
             rig_name=rig.name("name"),
             rig_licence=rig.name("licence"),
@@ -123,16 +138,40 @@ class Manifest:
             camera=_camera(fields.group("camera")),
             idle_fps=idle.number("fps", 0.1, 1000),
             entries=_entries(fields.group("entries")),
+            tier_errors=_tier_errors(fields.group("deformer")) if "deformer" in fields.values else {},
         )
         for group in (idle, rig, fields):
             group.finish()
         _check_points(where, manifest)
+        _check_version(where, manifest)
         return manifest
 
 
 def digest(data: bytes) -> str:
     """SHA-256 in lower-case hex."""
     return hashlib.sha256(data).hexdigest()
+
+
+def _check_version(where: str, manifest: Manifest) -> None:
+    """What version 2 brought makes a file unreadable to a reader of version 1, so such a file must say 2."""
+    brought = {
+        "precision mixed": manifest.precision == "mixed",
+        "deformer": bool(manifest.tier_errors),
+        INT8: INT8 in manifest.entries,
+    }
+    for name in (name for name, used in brought.items() if used and manifest.version < 2):
+        raise DataError(where, "version", expected=f"2 or more, for {name}", found=manifest.version)
+
+
+def _tier_errors(fields: _Fields) -> dict[str, tuple[float, float]]:
+    errors = {}
+    for tier in TIERS:
+        if tier in fields.values:
+            error = fields.group(tier)
+            errors[tier] = tuple(error.number(name, 0, MAX_ERROR_MM) for name in ("rms_mm", "max_mm"))
+            error.finish()
+    fields.finish()
+    return errors
 
 
 def _check_points(where: str, manifest: Manifest) -> None:
@@ -209,8 +248,8 @@ def _camera(fields: _Fields) -> Camera:
 
 def _entries(fields: _Fields) -> dict[str, tuple[int, str]]:
     entries = {}
-    for name in (*REQUIRED_ENTRIES, ONNX):
-        if name == ONNX and name not in fields.values:
+    for name in (*REQUIRED_ENTRIES, *OPTIONAL_ENTRIES):
+        if name in OPTIONAL_ENTRIES and name not in fields.values:
             continue
         entry = fields.group(name)
         size, sha256 = entry.integer("size", 1, MAX_ENTRY_BYTES[name]), entry.text("sha256")

@@ -64,6 +64,14 @@ def scan_onnx(data: bytes, *, source: str, size: int) -> OnnxSummary:
         raise DataError(source, field, expected=expected, found=found) from None
 
 
+def stores_half(data: bytes) -> bool:
+    """Whether a scanned network keeps any of its weights as float16 (see `onnx_half`)."""
+    model = _message(memoryview(data), "ModelProto", {1, 2, 3, 4, 5, 6, 7, 8, 14})
+    graph = _message(model[7][0], "GraphProto", {1, 2, 5, 10, 11, 12, 13, 16})
+    tensors = (_message(t, "TensorProto", {1, 2, 8, 9, 12, 14, 16}) for t in graph[5])
+    return any(tensor[2][-1:] == [FLOAT16] for tensor in tensors)
+
+
 def _scan_model(data: memoryview, size: int) -> OnnxSummary:
     _require(len(data) <= MAX_BYTES, "size", f"at most {MAX_BYTES} bytes", len(data))
     model = _message(data, "ModelProto", {1, 2, 3, 4, 5, 6, 7, 8, 14})

@@ -15,12 +15,15 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.bundle.container import Container
 from cap4d.bundle.manifest import Manifest, digest
 from cap4d.bundle.onnx_scan import scan_onnx
+from cap4d.bundle.packing import unpack
 from cap4d.bundle.png_header import check_png
+from cap4d.bundle.quantized_unet import check_quantized
 from cap4d.bundle.schema import (
     ENTRIES,
     GAUSSIANS,
     GRID,
     IDLE,
+    INT8,
     MANIFEST,
     MAX_ENTRY_BYTES,
     ONNX,
@@ -34,7 +37,10 @@ from cap4d.errors import DataError
 from cap4d.rig.grid import UvGrid
 from cap4d.rig.head import Subject
 
-DTYPES = {"F32": np.float32, "F16": np.float16, "U8": np.uint8, "U16": np.uint16, "U32": np.uint32}
+DTYPES = {
+    **{"F32": np.float32, "F16": np.float16, "I8": np.int8, "I32": np.int32},
+    **{"U8": np.uint8, "U16": np.uint16, "U32": np.uint32},
+}
 
 
 def read_bundle(path: str | Path) -> Bundle:
@@ -50,11 +56,8 @@ def read_bundle(path: str | Path) -> Bundle:
         check_relations(str(path), tensors)
         preview = _read_entry(container, PREVIEW, manifest)
         check_png(preview, source=f"{path}:{PREVIEW}")
-        network = None
-        if ONNX in manifest.entries:
-            network = _read_entry(container, ONNX, manifest)
-            scan_onnx(network, source=f"{path}:{ONNX}", size=manifest.counts["grid_size"])
-    return _assemble(manifest, tensors, network, preview)
+        networks = _read_networks(container, manifest)
+    return _assemble(manifest, tensors, networks, preview)
 
 
 def read_manifest(path: str | Path) -> Manifest:
@@ -92,7 +95,31 @@ def _read_entry(container: Container, name: str, manifest: Manifest) -> bytes:
     return data
 
 
+def _read_networks(
+    container: Container, manifest: Manifest
+) -> tuple[bytes | None, dict[str, np.ndarray] | None]:
+    """The network as ONNX and in whole numbers, as far as they are there."""
+    source, size = str(container.path), manifest.counts["grid_size"]
+    network = quantized = None
+    if ONNX in manifest.entries:
+        network = _read_entry(container, ONNX, manifest)
+        scan_onnx(network, source=f"{source}:{ONNX}", size=size)
+    if INT8 in manifest.entries:
+        quantized = _deserialize(container, INT8, manifest)
+        check_quantized(quantized, source=f"{source}:{INT8}", size=size)
+    return network, quantized
+
+
 def _read_tensors(container: Container, entry: str, manifest: Manifest) -> dict[str, np.ndarray]:
+    source, stored = str(container.path), _deserialize(container, entry, manifest)
+    form = {"counts": manifest.counts, "precision": manifest.precision, "version": manifest.version}
+    tensors = unpack(source, entry, stored, **form)
+    check_tensors(source, entry, tensors, **form)
+    return tensors
+
+
+def _deserialize(container: Container, entry: str, manifest: Manifest) -> dict[str, np.ndarray]:
+    """The tensors of an entry as they lie there, of any name and shape."""
     where = f"{container.path}:{entry}"
     try:
         items = safetensors.deserialize(_read_entry(container, entry, manifest))
@@ -104,14 +131,17 @@ def _read_tensors(container: Container, entry: str, manifest: Manifest) -> dict[
             expected = f"a dtype of {', '.join(DTYPES)}"
             raise DataError(where, name[:64], expected=expected, found=item["dtype"])
         tensors[name] = np.frombuffer(item["data"], DTYPES[item["dtype"]]).reshape(item["shape"])
-    check_tensors(str(container.path), entry, tensors, counts=manifest.counts, precision=manifest.precision)
     return tensors
 
 
 def _assemble(
-    manifest: Manifest, tensors: dict[str, dict[str, np.ndarray]], network: bytes | None, preview: bytes
+    manifest: Manifest,
+    tensors: dict[str, dict[str, np.ndarray]],
+    networks: tuple[bytes | None, dict[str, np.ndarray] | None],
+    preview: bytes,
 ) -> Bundle:
     grid_tensors = tensors[GRID]
+    linear = grid_tensors.get("deform_linear")
     grid = UvGrid(
         size=manifest.counts["grid_size"],
         pixels=grid_tensors["pixels"].astype(np.int16),
@@ -130,13 +160,16 @@ def _assemble(
         grid=grid,
         subject=subject if mesh is None else mesh.resample(grid.vertices, grid.bary),
         deform_neutral=grid_tensors["deform_neutral"].astype(np.float32),
-        deform_onnx=network,
+        deform_onnx=networks[0],
         **_floats(gaussians),
         binding=tensors[GAUSSIANS]["binding"].astype(np.int32),
         camera=manifest.camera,
         idle=Clip(manifest.rig_name, manifest.idle_fps, **_floats(tensors[IDLE])),
         preview=preview,
         mesh_subject=mesh,
+        deform_int8=networks[1],
+        deform_linear=None if linear is None else linear.astype(np.float32),
+        tier_errors=manifest.tier_errors,
         rig_vertices=manifest.counts["rig_vertices"],
     )
 

@@ -10,19 +10,23 @@ import numpy as np
 
 from cap4d.errors import DataError
 
-FORMAT, VERSION = "cap4d", 1
-PRECISIONS = ("float32", "float16")
+FORMAT, VERSION = "cap4d", 2
+PRECISIONS = ("float32", "float16", "mixed")
+"""`mixed`: every packed tensor is float32, float16 or int8, as its own dtype says."""
+TIERS = ("full", "fp16", "int8", "linear", "off")
+"""Ways to answer an expression with a deformation, from the dearest to the cheapest."""
 AXES, UNITS, RIG_AXES = "opencv", "metre", "y_up"
 
 MANIFEST, GRID, RIG = "manifest.json", "tensors/grid.safetensors", "tensors/rig.safetensors"
 GAUSSIANS, IDLE = "tensors/gaussians.safetensors", "idle.safetensors"
-ONNX, PREVIEW = "deform.onnx", "preview.png"
+ONNX, INT8, PREVIEW = "deform.onnx", "tensors/deform_int8.safetensors", "preview.png"
 REQUIRED_ENTRIES = (GAUSSIANS, GRID, IDLE, PREVIEW, RIG)
-ENTRIES = (MANIFEST, *REQUIRED_ENTRIES, ONNX)
+OPTIONAL_ENTRIES = (ONNX, INT8)
+ENTRIES = (MANIFEST, *REQUIRED_ENTRIES, *OPTIONAL_ENTRIES)
 MAX_ENTRY_BYTES = {
     MANIFEST: 1 << 20,
     PREVIEW: 16 << 20,
-    **dict.fromkeys((GRID, RIG, GAUSSIANS, IDLE, ONNX), 512 << 20),
+    **dict.fromkeys((GRID, RIG, GAUSSIANS, IDLE, ONNX, INT8), 512 << 20),
 }
 
 COUNTS = {
@@ -55,6 +59,7 @@ SYMBOLS = {
 }
 
 Kind = Literal["float", "packed", "index", "flag"]
+Steps = Literal["row", "column"]
 
 
 @dataclass(frozen=True)
@@ -63,10 +68,13 @@ class TensorSpec:
 
     Args:
         shape: Sizes: a number, or a symbol of `SYMBOLS`, or `9J`.
-        kind: `float` is float32; `packed` is float32, or float16 in the float16 form; `index` is the smaller
-            of uint16 and uint32 that holds indices `below`; `flag` is uint8, 0 or 1.
+        kind: `float` is float32; `packed` is as the file's precision says (see packing.py); `index` is the
+            smaller of uint16 and uint32 that holds indices `below`; `flag` is uint8, 0 or 1.
         low, high: Inclusive limits of float values.
         below: Symbol of the count that indices stay under.
+        steps: Whether each `row` (first index) or each `column` (the other indices) has its own step where
+            the tensor is int8. Those of rows may be masked.
+        since: The first version of the format that has it.
     """
 
     shape: tuple[int | str, ...]
@@ -75,6 +83,8 @@ class TensorSpec:
     high: float = 1e4
     below: str | None = None
     optional: bool = False
+    steps: Steps = "column"
+    since: int = 1
 
 
 METRES = {"low": -10.0, "high": 10.0}  # a head is 0.3 m: catches millimetres and rubbish alike
@@ -88,15 +98,16 @@ TENSORS: dict[str, dict[str, TensorSpec]] = {
         "vertices": TensorSpec(("G", 3), "index", below="V"),
         "bary": TensorSpec(("G", 3), low=-0.01, high=1.01),
         "deform_neutral": TensorSpec(("G", 3), **METRES),
+        "deform_linear": TensorSpec(("E", "G", 3), "packed", **METRES, optional=True, steps="row", since=2),
     },
     RIG: {
         "neutral": TensorSpec(("P", 3), **METRES),
-        "expression_basis": TensorSpec(("E", "P", 3), "packed", **METRES),
+        "expression_basis": TensorSpec(("E", "P", 3), "packed", **METRES, steps="row"),
         "joints": TensorSpec(("J", 3), **METRES),
         "joints_expression": TensorSpec(("E", "J", 3), **METRES),
         "skin_weights": TensorSpec(("P", "J"), low=-1e-3, high=1.001),
         "expr_rotation": TensorSpec(("E", 3), **RADIANS, optional=True),
-        "pose_basis": TensorSpec(("9J", "P", 3), "packed", **METRES, optional=True),
+        "pose_basis": TensorSpec(("9J", "P", 3), "packed", **METRES, optional=True, steps="row"),
         "pose_offset": TensorSpec(("P", 3), **METRES, optional=True),
     },
     GAUSSIANS: {
@@ -118,13 +129,20 @@ TENSORS: dict[str, dict[str, TensorSpec]] = {
 }
 
 
-def stored_dtype(spec: TensorSpec, counts: Mapping[str, int], precision: str) -> np.dtype:
-    """The dtype that a tensor has in the file."""
+def stored_dtype(spec: TensorSpec, counts: Mapping[str, int], precision: str = "float32") -> np.dtype:
+    """The dtype that a tensor has in the file; of a packed one, what `float32` or `float16` makes it."""
     if spec.kind == "flag":
         return np.dtype(np.uint8)
     if spec.kind == "index":
         return np.dtype(np.uint16 if counts[SYMBOLS[spec.below]] <= 1 << 16 else np.uint32)
     return np.dtype(np.float16 if spec.kind == "packed" and precision == "float16" else np.float32)
+
+
+def stored_dtypes(spec: TensorSpec, counts: Mapping[str, int], precision: str) -> tuple[np.dtype, ...]:
+    """The dtypes that a tensor may have in the file, or, of an int8 one, once it is unpacked."""
+    if spec.kind == "packed" and precision == "mixed":
+        return np.dtype(np.float32), np.dtype(np.float16)
+    return (stored_dtype(spec, counts, precision),)
 
 
 def stored_shape(spec: TensorSpec, counts: Mapping[str, int]) -> tuple[int, ...]:
@@ -135,14 +153,23 @@ def stored_shape(spec: TensorSpec, counts: Mapping[str, int]) -> tuple[int, ...]
 
 
 def check_tensors(
-    source: str, entry: str, tensors: Mapping[str, np.ndarray], *, counts: Mapping[str, int], precision: str
+    source: str,
+    entry: str,
+    tensors: Mapping[str, np.ndarray],
+    *,
+    counts: Mapping[str, int],
+    precision: str,
+    version: int = VERSION,
 ) -> None:
-    """Checks an entry's tensors, as stored, against the tables: names, dtypes, shapes, limits, finiteness.
+    """Checks an entry's tensors against the tables: names, dtypes, shapes, limits, finiteness.
 
+    Args:
+        tensors: As stored, except that int8 and masked ones are unpacked.
     Raises:
         DataError: Naming `source:entry`, the tensor, what was expected and what was found.
     """
-    where, specs = f"{source}:{entry}", TENSORS[entry]
+    where = f"{source}:{entry}"
+    specs = {name: spec for name, spec in TENSORS[entry].items() if spec.since <= version}
     for name in tensors:
         if name not in specs:
             raise DataError(where, "tensors", expected=f"only {', '.join(specs)}", found=repr(name[:64]))
@@ -156,11 +183,10 @@ def check_tensors(
 def _check_tensor(
     where: str, name: str, value: np.ndarray, spec: TensorSpec, counts: Mapping[str, int], precision: str
 ) -> None:
-    dtype, shape = stored_dtype(spec, counts, precision), stored_shape(spec, counts)
-    if value.dtype != dtype or value.shape != shape:
-        raise DataError(
-            where, name, expected=f"{dtype}{list(shape)}", found=f"{value.dtype}{list(value.shape)}"
-        )
+    dtypes, shape = stored_dtypes(spec, counts, precision), stored_shape(spec, counts)
+    if value.dtype not in dtypes or value.shape != shape:
+        expected = f"{' or '.join(map(str, dtypes))}{list(shape)}"
+        raise DataError(where, name, expected=expected, found=f"{value.dtype}{list(value.shape)}")
     if not value.size:
         return
     low, high = value.min(), value.max()
@@ -195,6 +221,9 @@ def check_relations(source: str, tensors: Mapping[str, Mapping[str, np.ndarray]]
         found = faces[np.argmax(repeated)].tolist()
         raise DataError(f"{source}:{GRID}", "faces", expected="three different vertices", found=found)
     _check_sums(f"{source}:{GRID}", "bary", grid["bary"], 1 - 1e-3, 1 + 1e-3)
+    if "deform_linear" in grid and grid["deform_linear"][:, grid["deformable"] == 0].any():
+        expected, found = "0 where the grid is not deformable", "another number"
+        raise DataError(f"{source}:{GRID}", "deform_linear", expected=expected, found=found)
     _check_sums(f"{source}:{RIG}", "skin_weights", rig["skin_weights"], -1e-3, 1 + 1e-3)
     quats = gaussians["quats"].astype(np.float32)
     norm2 = (quats * quats).sum(1)

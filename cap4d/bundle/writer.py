@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -12,11 +13,14 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.bundle.container import write_container
 from cap4d.bundle.manifest import Manifest, digest
 from cap4d.bundle.onnx_scan import scan_onnx
+from cap4d.bundle.packing import FORMS, Form, pack, unpack
 from cap4d.bundle.png_header import check_png
+from cap4d.bundle.quantized_unet import check_quantized
 from cap4d.bundle.schema import (
     GAUSSIANS,
     GRID,
     IDLE,
+    INT8,
     MANIFEST,
     ONNX,
     PREVIEW,
@@ -35,14 +39,17 @@ SUBJECT_ARRAYS = (
 )
 
 
-def write_bundle(
-    bundle: Bundle, path: str | Path, *, precision: Literal["float32", "float16"] = "float32"
-) -> None:
+PACKED = tuple(name for specs in TENSORS.values() for name, spec in specs.items() if spec.kind == "packed")
+Precision = Literal["float32", "float16"] | Mapping[str, Form]
+
+
+def write_bundle(bundle: Bundle, path: str | Path, *, precision: Precision = "float32") -> None:
     """Writes `bundle` to `path`, through a temporary file.
 
     Args:
         precision: `float16` halves the file: Gaussians, blendshapes and the deformer's weights are rounded
-            (this form needs the `onnx` package; playing it does not).
+            (this form needs the `onnx` package; playing it does not). Or a form for each of `PACKED`, and
+            float32 or float16 for `deform.onnx`; what is not named is float32.
     Raises:
         DataError: The bundle breaks a rule of FORMAT.md: whatever is written can be read.
         ArgumentError: The folder is not there, or `subject` is not the mixture of `mesh_subject`.
@@ -50,30 +57,70 @@ def write_bundle(
     path = Path(path)
     if not path.parent.is_dir():
         raise ArgumentError(f"{path}: its folder does not exist")
-    counts, subject = bundle_counts(bundle), stored_subject(bundle)
-    tensors = {
-        GRID: _grid_tensors(bundle),
-        RIG: {name: getattr(subject, name) for name in SUBJECT_ARRAYS if getattr(subject, name) is not None},
-        GAUSSIANS: {name: getattr(bundle, name) for name in TENSORS[GAUSSIANS]},
-        IDLE: {
-            name: getattr(bundle.idle, name)
-            for name in TENSORS[IDLE]
-            if getattr(bundle.idle, name) is not None
-        },
-    }
-    stored = {entry: _as_stored(entry, arrays, counts, precision) for entry, arrays in tensors.items()}
-    for entry, arrays in stored.items():
-        check_tensors(str(path), entry, arrays, counts=counts, precision=precision)
-    check_relations(str(path), stored)
-    entries = {entry: save_tensors(arrays) for entry, arrays in stored.items()}
+    write_container(path, bundle_entries(bundle, precision=precision, source=str(path)))
+
+
+def bundle_entries(
+    bundle: Bundle, *, precision: Precision = "float32", source: str = "bundle"
+) -> dict[str, bytes]:
+    """The entries that `write_bundle` writes, by name, the manifest first. See there.
+
+    Args:
+        source: For error messages.
+    """
+    forms = _forms(precision)
+    name = precision if isinstance(precision, str) else "mixed"
+    version = 2 if name == "mixed" or _is_of_version_2(bundle) else 1
+    entries = _tensor_entries(bundle, source, forms, precision=name, version=version)
     entries[PREVIEW] = bundle.preview
-    check_png(bundle.preview, source=f"{path}:{PREVIEW}")
+    check_png(bundle.preview, source=f"{source}:{PREVIEW}")
     if bundle.deform_onnx is not None:
-        entries[ONNX] = _network(bundle.deform_onnx, precision)
-        scan_onnx(entries[ONNX], source=f"{path}:{ONNX}", size=bundle.grid.size)
-    manifest = _manifest(bundle, counts, precision, entries)
-    Manifest.from_json(manifest, source=str(path))
-    write_container(path, {MANIFEST: manifest} | dict(sorted(entries.items())))
+        entries[ONNX] = _network(bundle.deform_onnx, forms[ONNX])
+        scan_onnx(entries[ONNX], source=f"{source}:{ONNX}", size=bundle.grid.size)
+    if bundle.deform_int8 is not None:
+        check_quantized(bundle.deform_int8, source=f"{source}:{INT8}", size=bundle.grid.size)
+        quantized = {name: np.ascontiguousarray(value) for name, value in bundle.deform_int8.items()}
+        entries[INT8] = save_tensors(quantized)
+    manifest = _manifest(bundle, entries, precision=name, version=version)
+    Manifest.from_json(manifest, source=source)
+    return {MANIFEST: manifest} | dict(sorted(entries.items()))
+
+
+def _forms(precision: Precision) -> dict[str, Form]:
+    """The form of each packed tensor and of the network."""
+    if isinstance(precision, str):
+        precision = dict.fromkeys((*PACKED, ONNX), precision)
+    for name, form in precision.items():
+        forms = FORMS[:2] if name == ONNX else FORMS
+        if name not in (*PACKED, ONNX) or form not in forms:
+            raise ArgumentError(f"precision: expected {', '.join(forms)} of a tensor, got {name}: {form}")
+    return dict.fromkeys((*PACKED, ONNX), "float32") | dict(precision)
+
+
+def _is_of_version_2(bundle: Bundle) -> bool:
+    return bundle.deform_int8 is not None or bundle.deform_linear is not None or bool(bundle.tier_errors)
+
+
+def _tensor_entries(
+    bundle: Bundle, source: str, forms: Mapping[str, Form], *, precision: str, version: int
+) -> dict[str, bytes]:
+    counts, subject = bundle_counts(bundle), stored_subject(bundle)
+    arrays = {
+        GRID: _grid_tensors(bundle),
+        RIG: {name: getattr(subject, name) for name in SUBJECT_ARRAYS},
+        GAUSSIANS: {name: getattr(bundle, name) for name in TENSORS[GAUSSIANS]},
+        IDLE: {name: getattr(bundle.idle, name) for name in TENSORS[IDLE]},
+    }
+    check = {"counts": counts, "precision": precision, "version": version}
+    tensors, entries = {}, {}
+    for entry, values in arrays.items():
+        present = {name: value for name, value in values.items() if value is not None}
+        stored = _as_stored(entry, present, counts, forms, version)
+        tensors[entry] = unpack(source, entry, stored, **check)
+        check_tensors(source, entry, tensors[entry], **check)
+        entries[entry] = save_tensors(stored)
+    check_relations(source, tensors)
+    return entries
 
 
 def bundle_counts(bundle: Bundle) -> dict[str, int]:
@@ -98,7 +145,8 @@ def stored_subject(bundle: Bundle) -> Subject:
     return mesh if mesh is not None and len(mesh.neutral) < len(bundle.subject.neutral) else bundle.subject
 
 
-def _manifest(bundle: Bundle, counts: dict[str, int], precision: str, entries: dict[str, bytes]) -> bytes:
+def _manifest(bundle: Bundle, entries: dict[str, bytes], *, precision: str, version: int) -> bytes:
+    counts = bundle_counts(bundle)
     on_mesh = stored_subject(bundle) is not bundle.subject
     if on_mesh:
         _check_mixture(bundle)
@@ -110,6 +158,7 @@ def _manifest(bundle: Bundle, counts: dict[str, int], precision: str, entries: d
             f"idle: expected a clip for {bundle.rig_name}, got one for {bundle.idle.rig_name}"
         )
     return Manifest(
+        version=version,
         precision=precision,
         rig_name=bundle.rig_name,
         rig_licence=bundle.rig_licence,
@@ -121,6 +170,7 @@ def _manifest(bundle: Bundle, counts: dict[str, int], precision: str, entries: d
         camera=bundle.camera,
         idle_fps=float(bundle.idle.fps),
         entries={name: (len(data), digest(data)) for name, data in entries.items()},
+        tier_errors=bundle.tier_errors,
     ).to_json()
 
 
@@ -132,7 +182,7 @@ def _check_mixture(bundle: Bundle) -> None:
             raise ArgumentError(f"subject.{name}: expected the mixture of mesh_subject's, got another")
 
 
-def _grid_tensors(bundle: Bundle) -> dict[str, np.ndarray]:
+def _grid_tensors(bundle: Bundle) -> dict[str, np.ndarray | None]:
     grid = bundle.grid
     return {
         "pixels": grid.pixels,
@@ -141,16 +191,25 @@ def _grid_tensors(bundle: Bundle) -> dict[str, np.ndarray]:
         "vertices": grid.vertices,
         "bary": grid.bary,
         "deform_neutral": bundle.deform_neutral,
+        "deform_linear": bundle.deform_linear,
     }
 
 
 def _as_stored(
-    entry: str, arrays: dict[str, np.ndarray], counts: dict[str, int], precision: str
+    entry: str,
+    arrays: dict[str, np.ndarray],
+    counts: dict[str, int],
+    forms: Mapping[str, Form],
+    version: int,
 ) -> dict[str, np.ndarray]:
-    """The arrays in the file's dtypes. Indices that a dtype cannot hold stay, for the checks to name."""
+    """The arrays as the file has them. Indices that a dtype cannot hold stay, for the checks to name."""
     stored = {}
     for name, array in arrays.items():
-        dtype = stored_dtype(TENSORS[entry][name], counts, precision)
+        spec = TENSORS[entry][name]
+        if spec.kind == "packed" and version >= 2:
+            stored |= pack(name, array, spec, forms[name])
+            continue
+        dtype = np.dtype(forms[name]) if spec.kind == "packed" else stored_dtype(spec, counts)
         with np.errstate(over="ignore", invalid="ignore"):
             cast = np.ascontiguousarray(array, dtype)
         lossless = dtype.kind == "f" or np.array_equal(cast, array)
@@ -158,8 +217,8 @@ def _as_stored(
     return stored
 
 
-def _network(model: bytes, precision: str) -> bytes:
-    if precision == "float32":
+def _network(model: bytes, form: Form) -> bytes:
+    if form == "float32":
         return model
     from cap4d.bundle.onnx_half import halve_weights
 

@@ -7,19 +7,19 @@ from typing import Literal
 
 import numpy as np
 
+from cap4d import _core
 from cap4d.bind import bind_fast
 from cap4d.bundle.bundle import Bundle
 from cap4d.bundle.reader import read_bundle
-from cap4d.bundle.schema import ONNX
-from cap4d.camera import Camera, opencv_from_rig
+from cap4d.camera import Camera
 from cap4d.drive.clip import Clip, Frame
 from cap4d.errors import ArgumentError
 from cap4d.gaussians import Gaussians
-from cap4d.player.deformer import Deformer
 from cap4d.player.stages import Stages
-from cap4d.render import render
+from cap4d.player.surface import Surface
+from cap4d.player.tiers import BUDGET_MS, choose_tier, moving_subject
 
-DEFORMERS = ("auto", "full", "off")
+Tier = Literal["auto", "full", "fp16", "int8", "linear", "off"]
 
 
 class Avatar:
@@ -27,43 +27,61 @@ class Avatar:
 
     Args:
         bundle: The avatar.
-        deformer: `full` (what `auto` means) runs the network; `off` leaves its neutral correction only.
+        deformer: How the network is evaluated: `full`, `fp16` or `int8` run it, `linear` adds what was
+            learned of it to the expressions, `off` leaves its neutral correction only. `auto`: the most exact
+            that keeps up on this machine (`tiers.choose_tier`).
         threads: For the network and the renderer; 0: see `deformer.default_threads`.
         source: The file it came from, for error messages.
+        deformer_budget_ms: What a pass may take for `auto`; infinity is the most exact, unmeasured.
+    Raises:
+        ArgumentError: The bundle does not have that deformer.
+        DataError: Its network does not load.
     """
 
     def __init__(
         self,
         bundle: Bundle,
         *,
-        deformer: Literal["auto", "full", "off"] = "auto",
+        deformer: Tier = "auto",
         threads: int = 0,
         source: str = "avatar",
+        deformer_budget_ms: float = BUDGET_MS,
     ) -> None:
-        if deformer not in DEFORMERS:
-            raise ArgumentError(f"deformer: expected one of {', '.join(DEFORMERS)}, got {deformer}")
         self.bundle, self.threads = bundle, threads
         self.stages = Stages()
-        self.deformer: Deformer | None = None
-        if bundle.deform_onnx is not None and deformer != "off":
-            name = f"{source}:{ONNX}"
-            self.deformer = Deformer(bundle.deform_onnx, size=bundle.grid.size, source=name, threads=threads)
-        # Mixing leaves strided arrays, which every product would copy: 45 ms a frame instead of 1 at E = 65.
-        self._subject = bundle.subject.map(np.ascontiguousarray)
-        self._neutral = self._subject.pose(np.zeros(bundle.n_expressions, np.float32))
-        self._deformable = bundle.grid.deformable[:, None]
+        self.tier, self.deformer = choose_tier(
+            bundle, deformer, threads=threads, source=source, budget_ms=deformer_budget_ms
+        )
+        self.surface = Surface(moving_subject(bundle, self.tier), bundle, self.deformer, threads=threads)
         self._opacities = _sigmoid(bundle.opacity_logits)
+        # Neighbours on the surface lie side by side in memory.
+        self.gaussian_order = np.argsort(bundle.binding, kind="stable")
+        self.splatter = _splatter(bundle, self._opacities, self.gaussian_order)
+        # In turns: a picture can be drawn from one frame's vertices while the next frame's are made.
+        self._vertices = [np.empty((len(bundle.grid), 3), np.float32) for _ in range(2)]
 
     @classmethod
     def load(
-        cls, path: str | Path, *, deformer: Literal["auto", "full", "off"] = "auto", threads: int = 0
+        cls,
+        path: str | Path,
+        *,
+        deformer: Tier = "auto",
+        threads: int = 0,
+        deformer_budget_ms: float = BUDGET_MS,
     ) -> Avatar:
         """Reads a `.cap4d` file.
 
         Raises:
+            ArgumentError: It does not have that deformer.
             DataError: It is not sound; see `cap4d.bundle.read_bundle`.
         """
-        return cls(read_bundle(path), deformer=deformer, threads=threads, source=str(path))
+        return cls(
+            read_bundle(path),
+            deformer=deformer,
+            threads=threads,
+            source=str(path),
+            deformer_budget_ms=deformer_budget_ms,
+        )
 
     @property
     def camera(self) -> Camera:
@@ -98,15 +116,17 @@ class Avatar:
         Raises:
             ArgumentError: A wrong length, or a number that is not finite.
         """
-        subject = self._subject
-        expr = self._checked(expr)
-        rotations = {"eye_rot": _rotation("eye_rot", eye_rot), "jaw_rot": _rotation("jaw_rot", jaw_rot)}
-        neck_rot = _rotation("neck_rot", neck_rot)
-        with self.stages.time("rig"):
-            straight = subject.pose(expr, **rotations)
-            posed = straight if neck_rot is None else subject.pose(expr, neck_rot=neck_rot, **rotations)
-        with self.stages.time("deform"):
-            return opencv_from_rig(posed) + self._deformation(straight, rotations["jaw_rot"])
+        out = np.empty((len(self.bundle.grid), 3), np.float32)
+        self._pose(out, expr, eye_rot=eye_rot, neck_rot=neck_rot, jaw_rot=jaw_rot)
+        return out
+
+    def move(self, frame: Frame) -> np.ndarray:
+        """`vertices` of a driven frame, in memory of the avatar's own: the call after the next overwrites it."""
+        self.check_rig(frame.rig_name)
+        self._vertices.reverse()
+        rotations = {name: getattr(frame, name) for name in ("eye_rot", "neck_rot", "jaw_rot")}
+        self._pose(self._vertices[0], frame.expr, **rotations)
+        return self._vertices[0]
 
     def pose(
         self,
@@ -143,20 +163,47 @@ class Avatar:
         Returns:
             uint8[H, W, 4] sRGB and alpha (255 everywhere with a background).
         """
-        gaussians = self.pose(expr, eye_rot=eye_rot, neck_rot=neck_rot, jaw_rot=jaw_rot)
-        camera = self.camera if camera is None else camera
-        with self.stages.time("splat"):
-            drawn = render(gaussians, camera, background=background or (0.0, 0.0, 0.0), threads=self.threads)
-        with self.stages.time("encode"):
-            return _rgba8(drawn.rgb, drawn.alpha, straight=background is None)
+        vertices = self._vertices[0]
+        self._pose(vertices, expr, eye_rot=eye_rot, neck_rot=neck_rot, jaw_rot=jaw_rot)
+        return self.splat(vertices, self.camera if camera is None else camera, background=background)
+
+    def splat(
+        self,
+        vertices: np.ndarray,
+        camera: Camera,
+        *,
+        background: tuple[float, float, float] | None = None,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """The picture of posed vertices; see `render`.
+
+        Args:
+            vertices: float32[G, 3] as of `vertices`.
+            out: uint8[H, W, 4] to draw into, so that nothing is allocated; None makes one.
+        """
+        if out is None:
+            out = np.empty((camera.height, camera.width, 4), np.uint8)
+        elif out.shape != (camera.height, camera.width, 4):
+            found = list(out.shape)
+            raise ArgumentError(f"out: expected uint8[{camera.height}, {camera.width}, 4], got {found}")
+        self.splatter.draw(out, camera.viewmat, camera.K, background, vertices, self.threads)
+        parts = self.splatter.seconds
+        self.stages.add("bind", parts.pop("bind"))
+        self.stages.add("splat", sum(parts.values()))
+        for part, seconds in parts.items():
+            self.stages.add(part, seconds)
+        return out
 
     def draw(
-        self, frame: Frame, camera: Camera, *, background: tuple[float, float, float] | None = None
+        self,
+        frame: Frame,
+        camera: Camera,
+        *,
+        background: tuple[float, float, float] | None = None,
+        out: np.ndarray | None = None,
     ) -> np.ndarray:
         """`render` of a driven frame. Its head pose is the camera's business (`camera.head_fixed`)."""
-        self.check_rig(frame.rig_name)
-        rotations = {name: getattr(frame, name) for name in ("eye_rot", "neck_rot", "jaw_rot")}
-        return self.render(frame.expr, camera, background=background, **rotations)
+        return self.splat(self.move(frame), camera, background=background, out=out)
 
     def check_rig(self, name: str) -> None:
         """Refuses expressions of another rig.
@@ -177,17 +224,18 @@ class Avatar:
             raise ArgumentError(f"expr: expected {n} finite numbers ({name}), got one that is not")
         return expr
 
-    def _deformation(self, straight: np.ndarray, jaw_rot: np.ndarray | None) -> np.ndarray:
-        """[G, 3] m, OpenCV axes: in the mask the network's answer, elsewhere its neutral one (fact 24)."""
-        bundle = self.bundle
-        if self.deformer is None:
-            return bundle.deform_neutral
-        neutral = self._neutral
-        if jaw_rot is not None:
-            neutral = self._subject.pose(np.zeros(bundle.n_expressions, np.float32), jaw_rot=jaw_rot)
-        offsets = bundle.grid.to_map(opencv_from_rig(straight - neutral))
-        answer = bundle.grid.from_map(self.deformer(np.ascontiguousarray(offsets)))
-        return np.where(self._deformable, answer, bundle.deform_neutral)
+    def _pose(self, out: np.ndarray, expr: np.ndarray, **rotations: np.ndarray | None) -> None:
+        checked = {name: _rotation(name, value) for name, value in rotations.items()}
+        self.surface.pose(self._checked(expr), out, **checked, stages=self.stages)
+
+
+def _splatter(bundle: Bundle, opacities: np.ndarray, order: np.ndarray) -> _core.Splatter:
+    rows = (bundle.means, bundle.quats, np.exp(bundle.log_scales), opacities, bundle.sh)
+    return _core.Splatter(
+        *(np.ascontiguousarray(x[order], np.float32) for x in rows),
+        np.ascontiguousarray(bundle.binding[order]),
+        bundle.grid.faces,
+    )
 
 
 def _rotation(name: str, value: np.ndarray | None) -> np.ndarray | None:
@@ -202,13 +250,3 @@ def _rotation(name: str, value: np.ndarray | None) -> np.ndarray | None:
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
     return (0.5 + 0.5 * np.tanh(0.5 * x)).astype(np.float32)
-
-
-def _rgba8(rgb: np.ndarray, alpha: np.ndarray, *, straight: bool) -> np.ndarray:
-    """float32 [H, W, 3] and [H, W] -> uint8[H, W, 4], rounded."""
-    image = np.empty((*alpha.shape, 4), np.uint8)
-    if straight:
-        rgb = rgb / np.maximum(alpha, 1e-6)[..., None]
-    image[..., :3] = np.clip(rgb, 0, 1) * np.float32(255) + np.float32(0.5)
-    image[..., 3] = np.clip(alpha, 0, 1) * np.float32(255) + np.float32(0.5) if straight else 255
-    return image

@@ -1,76 +1,141 @@
-"""The deformation network at run time: onnxruntime on a few threads that do not spin."""
+"""The deformation network at run time: onnxruntime on a few threads that do not spin, or whole numbers."""
 
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import onnxruntime
 
-from cap4d.errors import DataError
+from cap4d import _core
+from cap4d.errors import ArgumentError, DataError
 
 MAX_THREADS = 4  # beyond it a batch of one at 128 x 128 gains nothing
+TIMED_PASSES = 3
+
+Network = Callable[[np.ndarray, np.ndarray], None]
+"""(offsets, answer), both float32[3, S, S]; fills in the answer."""
 
 
 class Deformer:
     """A loaded network: offsets float32[3, S, S] m -> deformation float32[3, S, S] m (facts 20-24).
 
-    The pass is skipped while the offsets stay the same.
+    The pass is skipped while the offsets stay the same. Not for use from two threads at once.
 
     Args:
-        model: The ONNX file, already scanned (`bundle.onnx_scan`).
+        network: The ONNX file, already scanned (`bundle.onnx_scan`), or the tensors of its int8 form, already
+            checked (`bundle.quantized_unet`).
         size: S.
         source: For error messages.
         threads: 0: `CAP4D_THREADS`, else the machine's cores, at most four.
     Raises:
-        DataError: onnxruntime cannot load it.
+        DataError: It cannot be loaded.
     """
 
-    def __init__(self, model: bytes, *, size: int, source: str = "deform.onnx", threads: int = 0) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads or default_threads()
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 4
-        # Spinning threads take the cores from the renderer: 37-41 ms a frame instead of 21-23 (two cores).
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self.source, self.size = source, size
+    def __init__(
+        self,
+        network: bytes | Mapping[str, np.ndarray],
+        *,
+        size: int,
+        source: str = "deform.onnx",
+        threads: int = 0,
+    ) -> None:
+        self.source, self.shape = source, (3, size, size)
+        self._offsets = np.zeros(self.shape, np.float32)
+        # In turns, so that one frame's answer is still there while the next frame's is made.
+        self._answers = [np.zeros(self.shape, np.float32) for _ in range(2)]
+        self._flags = np.empty(self.shape, bool)
+        load = _onnx_network if isinstance(network, bytes) else _quantized_network
         try:
-            # The "fallback" would try the same again and print a banner.
-            self.session = onnxruntime.InferenceSession(
-                model, options, providers=["CPUExecutionProvider"], enable_fallback=0
-            )
-        except Exception as error:  # onnxruntime's own types; all mean that the network is not sound
-            raise DataError(
-                source, "network", expected="one that onnxruntime loads", found=str(error)[:200]
-            ) from None
+            self._network: Network = load(network, self._offsets, self._answers, threads or default_threads())
+        except Exception as error:  # a runtime's own types; all mean that the network is not sound
+            expected = "one that onnxruntime loads" if isinstance(network, bytes) else "one that runs"
+            raise DataError(source, "network", expected=expected, found=str(error)[:200]) from None
         self.passes = 0
-        self._offsets: np.ndarray | None = None
-        self._deformation = np.zeros((3, size, size), np.float32)
 
     def __call__(self, offsets: np.ndarray) -> np.ndarray:
-        """The deformation for these offsets; the array is the deformer's own and must not be written to.
+        """The deformation for these offsets.
+
+        The array is the deformer's own: it must not be written to, and the pass after the next overwrites it.
 
         Raises:
+            ArgumentError: The offsets have another shape.
             DataError: The network fails, or answers with something that is not finite.
         """
-        if self._offsets is None or not np.array_equal(offsets, self._offsets):
-            self._deformation = self._run(offsets)
-            self._offsets = offsets.copy()
+        if offsets.shape != self.shape:
+            raise ArgumentError(f"offsets: expected float32{list(self.shape)}, got {list(offsets.shape)}")
+        if self.passes == 0 or not np.equal(offsets, self._offsets, out=self._flags).all():
+            self._pass(offsets)
             self.passes += 1
-        return self._deformation
+        return self._answers[0]
 
-    def _run(self, offsets: np.ndarray) -> np.ndarray:
-        shape = (1, 3, self.size, self.size)
+    def milliseconds(self) -> float:
+        """What a pass takes: the quickest of three after one that warms up. Forgets the last answer."""
+        times, zeros = [], np.zeros(self.shape, np.float32)
+        for _ in range(1 + TIMED_PASSES):
+            start = time.perf_counter()
+            self._pass(zeros)
+            times.append(time.perf_counter() - start)
+        return 1e3 * min(times[1:])
+
+    def _pass(self, offsets: np.ndarray) -> None:
+        self._answers.reverse()
+        answer = self._answers[0]
+        np.copyto(self._offsets, offsets)
         try:
-            (answer,) = self.session.run(["deformation"], {"offsets": offsets.reshape(shape)})
+            self._network(self._offsets, answer)
         except Exception as error:  # as above
-            raise DataError(
-                self.source, "network", expected="one that runs", found=str(error)[:200]
-            ) from None
-        if answer.shape != shape or answer.dtype != np.float32 or not np.isfinite(answer).all():
-            found = f"{answer.dtype}{list(answer.shape)}, finite: {bool(np.isfinite(answer).all())}"
-            raise DataError(self.source, "deformation", expected=f"finite float32{list(shape)}", found=found)
-        return answer[0]
+            self._offsets.fill(np.nan)  # equal to nothing: the next call tries again
+            found = str(error)[:200]
+            raise DataError(self.source, "network", expected="one that runs", found=found) from None
+        if not np.isfinite(answer, out=self._flags).all():
+            self._offsets.fill(np.nan)
+            expected, found = f"finite float32{list(self.shape)}", "a value that is not finite"
+            raise DataError(self.source, "deformation", expected=expected, found=found)
+
+
+def _onnx_network(model: bytes, offsets: np.ndarray, answers: list[np.ndarray], threads: int) -> Network:
+    """onnxruntime on the memory of these very arrays: a pass allocates nothing that the first did not.
+
+    `session.set_denormal_as_zero` is left alone: it gains nothing here, and it would change the arithmetic of
+    the caller's thread for good.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    # Spinning threads take the cores from the renderer: 37-41 ms a frame instead of 21-23 (two cores).
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # The "fallback" would try the same again and print a banner.
+    session = onnxruntime.InferenceSession(
+        model, options, providers=["CPUExecutionProvider"], enable_fallback=0
+    )
+
+    def bound(answer: np.ndarray) -> onnxruntime.IOBinding:
+        binding, shape = session.io_binding(), (1, *answer.shape)
+        binding.bind_input("offsets", "cpu", 0, np.float32, shape, offsets.ctypes.data)
+        binding.bind_output("deformation", "cpu", 0, np.float32, shape, answer.ctypes.data)
+        return binding
+
+    bindings = {answer.ctypes.data: bound(answer) for answer in answers}
+
+    def run(_: np.ndarray, answer: np.ndarray) -> None:
+        session.run_with_iobinding(bindings[answer.ctypes.data])
+
+    return run
+
+
+def _quantized_network(
+    tensors: Mapping[str, np.ndarray], offsets: np.ndarray, answers: list[np.ndarray], threads: int
+) -> Network:
+    unet = _core.QuantizedUnet(dict(tensors), offsets.shape[-1])
+
+    def run(offsets: np.ndarray, answer: np.ndarray) -> None:
+        answer[:] = unet.run(offsets, threads)
+
+    return run
 
 
 def default_threads() -> int:

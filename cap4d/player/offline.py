@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from cap4d.drive.clip import Clip, Frame
 from cap4d.drive.sample import sample
 from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
-from cap4d.player.avatar import Avatar
+from cap4d.player.avatar import Avatar, Tier
 from cap4d.player.camera_path import CameraPath, camera_path
 from cap4d.player.stages import peak_memory_mb
 from cap4d.player.video import MAX_SIDE, VideoWriter, check_file, check_output
@@ -157,9 +158,13 @@ def render_file(
     size: str | None = None,
     frames: int | None = None,
     stats: Path | None = None,
+    deformer: Tier = "auto",
 ) -> dict[str, Any]:
-    """`cap4d render`: see `render_to`; `drive`, `template` and `fps` are `open_source`'s, `size` is `WxH`."""
-    player = Avatar.load(avatar)
+    """`cap4d render`: see `render_to`; `drive`, `template` and `fps` are `open_source`'s, `size` is `WxH`.
+
+    Nobody waits for a file, and it should not depend on the machine: `auto` is the most exact deformer.
+    """
+    player = Avatar.load(avatar, deformer=deformer, deformer_budget_ms=math.inf)
     clip = open_source(drive, player.bundle, template=template, fps=fps)
     wanted = Output(output, frames=frames, size=None if size is None else parse_size(size), stats=stats)
     found = render_to(player, clip, camera, wanted)
@@ -202,7 +207,10 @@ def statistics(
     return {
         "schema": STATS_SCHEMA,
         "backend": backend,
-        "deformer": "off" if avatar.deformer is None else "full",
+        "deformer": avatar.tier,
+        "tier_errors": {
+            tier: {"rms_mm": rms, "max_mm": worst} for tier, (rms, worst) in avatar.bundle.tier_errors.items()
+        },
         "gaussians": len(avatar.bundle),
         "width": size[0],
         "height": size[1],

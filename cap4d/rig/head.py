@@ -100,13 +100,7 @@ class Subject:
         """
         unskinned = self.neutral + _combine(expr, self.expression_basis)
         joints = self.joints + _combine(expr, self.joints_expression)
-        rotations = {"eyes": eye_rot, "neck": neck_rot, "jaw": jaw_rot}
-        rotations["expr"] = None if self.expr_rotation is None else expr @ self.expr_rotation
-        turns = {}  # joint index -> R - I
-        for j, driver in enumerate(self.joint_drivers):
-            if rotations[driver] is not None:
-                rotmat = axis_angle_to_rotmat(rotations[driver])
-                turns[j] = rotmat - identity_like(rotmat)
+        turns = self._turns(expr, eyes=eye_rot, neck=neck_rot, jaw=jaw_rot)
         if self.pose_offset is not None:
             unskinned = unskinned + self.pose_offset
         if self.pose_basis is not None:
@@ -118,6 +112,31 @@ class Subject:
             arm = unskinned - joints[..., j : j + 1, :]
             posed = posed + self.skin_weights[:, j : j + 1] * (arm @ turn.swapaxes(-1, -2))
         return posed
+
+    def skin_transform(
+        self,
+        expr: Array,
+        *,
+        eye_rot: Array | None = None,
+        neck_rot: Array | None = None,
+        jaw_rot: Array | None = None,
+    ) -> Array:
+        """[..., V, 3, 3] what `pose` multiplies a displacement of each vertex by: I + sum_j w_j (R_j - I)."""
+        turns = self._turns(expr, eyes=eye_rot, neck=neck_rot, jaw=jaw_rot)
+        transform = identity_like(self.neutral) + 0 * self.neutral[:, :, None]
+        for j, turn in turns.items():
+            transform = transform + self.skin_weights[:, j, None, None] * turn[..., None, :, :]
+        return transform
+
+    def _turns(self, expr: Array, **rotations: Array | None) -> dict[int, Array]:
+        """[..., 3, 3] R - I of each joint that turns, by its number; `rotations` by what drives it."""
+        rotations["expr"] = None if self.expr_rotation is None else expr @ self.expr_rotation
+        turns = {}
+        for j, driver in enumerate(self.joint_drivers):
+            if rotations[driver] is not None:
+                rotmat = axis_angle_to_rotmat(rotations[driver])
+                turns[j] = rotmat - identity_like(rotmat)
+        return turns
 
     def map(self, function: Callable[[Array], Array]) -> Subject:
         """The same subject with `function` applied to every array, e.g. to make torch tensors of them."""

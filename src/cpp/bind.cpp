@@ -6,7 +6,7 @@
 
 #include "constants.h"
 #include "parallel.h"
-#include "tiles.h"
+#include "scratch.h"
 
 namespace cap4d {
 namespace {
@@ -117,6 +117,28 @@ void bind(const float* vertices, const BoundGaussians& bound, int threads, float
       bind_one(frames[bound.binding[i]], bound.means + 3 * i, bound.quats + 4 * i, bound.log_scales + 3 * i, means + 3 * i, quats + 4 * i,
                scales + 3 * i);
   });
+}
+
+TriangleFrame triangle_frame(const float* vertices, const std::int32_t* face) {
+  const Triangle t = triangle_at(vertices, face);
+  const Frame f = frame_of(t);
+  TriangleFrame out{};
+  for (int i = 0; i < 9; ++i) out.turn[i] = f.size * f.rotmat[i];
+  std::copy_n(f.centre, 3, out.centre);
+  out.size = f.size;
+  out.flat = dot(t.axes[1], t.axes[1]) < 0.5;
+  return out;
+}
+
+void upright(const TriangleFrame& frame, float* rotmat) {
+  double axes[9];
+  for (int i = 0; i < 9; ++i) axes[i] = frame.turn[i] / frame.size;
+  float q[4];
+  rotmat_to_quat(axes, q);
+  const float w = q[0], x = q[1], y = q[2], z = q[3];
+  const float r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+                      2 * (y * z - w * x),     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
+  std::copy_n(r, 9, rotmat);
 }
 
 // backward ------------------------------------------------------------------------------------------------------------------

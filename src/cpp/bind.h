@@ -3,6 +3,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "packed.h"
+
 namespace cap4d {
 
 // What does not change while the mesh moves (not owned). Indices are checked by the caller.
@@ -16,6 +18,12 @@ struct BoundGaussians {
 // means = R (s x) + centre, scales = exp(log_scales) s, quats = q_face (x) normalise(quats).
 // A triangle without area gets some rotation and its own (possibly zero) size; nothing becomes NaN that was not.
 void bind(const float* vertices, const BoundGaussians& bound, int threads, float* means, float* quats, float* scales);
+
+// The place of one triangle, in double as `bind` has it.
+TriangleFrame triangle_frame(const float* vertices, const std::int32_t* face);
+
+// The rotation that `bind` gives to what rides on a flat triangle, in place of its `turn`.
+void upright(const TriangleFrame& frame, float* rotmat);
 
 // The VJP of `bind`: from gradients of its outputs to those of vertices [G, 3], means, quats and log_scales, all overwritten.
 // A triangle without area passes on what moves its centre and nothing else; a Gaussian whose pose is not finite passes on nothing.

@@ -1,9 +1,8 @@
-#include <pybind11/numpy.h>
-
 #include <stdexcept>
 #include <string>
 
 #include "bind.h"
+#include "bind_arguments.h"
 #include "bindings.h"
 
 namespace py = pybind11;
@@ -11,18 +10,9 @@ namespace py = pybind11;
 namespace cap4d {
 namespace {
 
-using FloatArray = py::array_t<float, py::array::c_style>;
-using IntArray = py::array_t<std::int32_t, py::array::c_style>;
-
 void expect_rows(const py::array& a, const char* name, py::ssize_t rows, py::ssize_t columns) {
   if (a.ndim() != 2 || a.shape(1) != columns || (rows >= 0 && a.shape(0) != rows))
     throw std::invalid_argument(std::string(name) + ": expected [" + (rows < 0 ? "any" : std::to_string(rows)) + ", " + std::to_string(columns) + "]");
-}
-
-void expect_below(const IntArray& indices, const char* name, py::ssize_t limit) {
-  for (py::ssize_t i = 0; i < indices.size(); ++i)
-    if (indices.data()[i] < 0 || indices.data()[i] >= limit)
-      throw std::invalid_argument(std::string(name) + ": index " + std::to_string(indices.data()[i]) + " is out of range");
 }
 
 // The arguments that `bind` and its VJP share, checked.

@@ -1,15 +1,8 @@
-#include <pybind11/numpy.h>
-#include <pybind11/stl.h>
-
 #include <algorithm>
-#include <array>
-#include <cmath>
-#include <optional>
 #include <stdexcept>
-#include <string>
 
+#include "bind_arguments.h"
 #include "bindings.h"
-#include "constants.h"
 #include "parallel.h"
 #include "render.h"
 
@@ -17,64 +10,6 @@ namespace py = pybind11;
 
 namespace cap4d {
 namespace {
-
-using FloatArray = py::array_t<float, py::array::c_style>;
-using DoubleArray = py::array_t<double, py::array::c_style>;
-using Background = std::optional<std::array<float, 3>>;
-
-std::string shape_text(const py::ssize_t* sizes, std::size_t count) {
-  std::string text = "[";
-  for (std::size_t i = 0; i < count; ++i) text.append(i ? ", " : "").append(std::to_string(sizes[i]));
-  return text + "]";
-}
-
-std::string describe(const py::array& a) { return shape_text(a.shape(), a.ndim()); }
-
-void expect(const py::array& a, const char* name, std::initializer_list<py::ssize_t> shape) {
-  if (a.ndim() != static_cast<py::ssize_t>(shape.size()) || !std::equal(shape.begin(), shape.end(), a.shape()))
-    throw std::invalid_argument(std::string(name) + ": expected " + shape_text(shape.begin(), shape.size()) + ", got " + describe(a));
-}
-
-struct Inputs {
-  FloatArray means, quats, scales, opacities, sh;
-  GaussiansView view;
-};
-
-Inputs make_inputs(FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh, int sh_degree) {
-  const py::ssize_t n = means.ndim() ? means.shape(0) : 0;
-  if (n >= (py::ssize_t{1} << 31)) throw std::invalid_argument("means: more than 2^31 Gaussians");
-  expect(means, "means", {n, 3});
-  expect(quats, "quats", {n, 4});
-  expect(scales, "scales", {n, 3});
-  expect(opacities, "opacities", {n});
-  const int stored = sh.ndim() == 3 ? static_cast<int>(sh.shape(1)) : 0;
-  if (stored != 1 && stored != 4 && stored != 9 && stored != 16) throw std::invalid_argument("sh: expected [N, 1|4|9|16, 3], got " + describe(sh));
-  expect(sh, "sh", {n, stored, 3});
-  const int degree = stored == 1 ? 0 : stored == 4 ? 1 : stored == 9 ? 2 : 3;
-  if (sh_degree > degree) throw std::invalid_argument("sh_degree: expected at most " + std::to_string(degree) + ", got " + std::to_string(sh_degree));
-  const GaussiansView view{static_cast<std::size_t>(n), stored, sh_degree < 0 ? degree : sh_degree,
-                           means.data(), quats.data(), scales.data(), opacities.data(), sh.data()};
-  return {means, quats, scales, opacities, sh, view};
-}
-
-Camera checked_camera(const DoubleArray& viewmat, const DoubleArray& K, int width, int height) {
-  expect(viewmat, "viewmat", {4, 4});
-  expect(K, "K", {3, 3});
-  if (width < 1 || height < 1 || width > kMaxSide || height > kMaxSide)
-    throw std::invalid_argument("size: expected 1 to " + std::to_string(kMaxSide) + " px a side, got " + std::to_string(width) + "x" + std::to_string(height));
-  for (int i = 0; i < 16; ++i)
-    if (!std::isfinite(viewmat.data()[i])) throw std::invalid_argument("viewmat: expected finite numbers");
-  for (int i = 0; i < 9; ++i)
-    if (!std::isfinite(K.data()[i])) throw std::invalid_argument("K: expected finite numbers");
-  if (!(K.data()[0] > 0) || !(K.data()[4] > 0)) throw std::invalid_argument("K: expected positive focal lengths");
-  return make_camera(viewmat.data(), K.data(), width, height);
-}
-
-struct OwnedImage {
-  FloatArray rgb, alpha, depth;
-  OwnedImage(int height, int width) : rgb({height, width, 3}), alpha({height, width}), depth({height, width}) {}
-  Image view() { return {rgb.mutable_data(), alpha.mutable_data(), depth.mutable_data()}; }
-};
 
 py::tuple render(FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh, DoubleArray viewmat, DoubleArray K,
                  int width, int height, Background background, int sh_degree, int threads) {
@@ -84,7 +19,8 @@ py::tuple render(FloatArray means, FloatArray quats, FloatArray scales, FloatArr
   const Image out = image.view();
   {
     py::gil_scoped_release release;
-    render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kPlay, threads, out);
+    Rendered rendered;
+    render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kPlay, threads, out, rendered);
   }
   return py::make_tuple(image.rgb, image.alpha, image.depth);
 }
@@ -103,7 +39,7 @@ py::tuple rasterize(FloatArray means, FloatArray quats, FloatArray scales, Float
   std::int32_t* radius = radii.mutable_data();
   {
     py::gil_scoped_release release;
-    *rendered = render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kTrain, threads, out);
+    render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kTrain, threads, out, *rendered);
     std::copy_n(rendered->radii.get(), n, radius);
     for (py::ssize_t i = 0; i < n; ++i) {
       const bool drawn = radius[i] > 0;
@@ -143,7 +79,7 @@ py::tuple rasterize_vjp(const Rendered& rendered, FloatArray means, FloatArray q
 void register_render(py::module_& m) {
   py::class_<Rendered>(m, "Rendered", "What the forward pass leaves for the gradient.")
       .def_property_readonly("drawn", [](const Rendered& r) { return r.drawn; })
-      .def_property_readonly("pairs", [](const Rendered& r) { return r.pairs.count; });
+      .def_property_readonly("pairs", [](const Rendered& r) { return r.pairs; });
   const auto means = py::arg("means").noconvert();
   const auto quats = py::arg("quats").noconvert();
   const auto scales = py::arg("scales").noconvert();

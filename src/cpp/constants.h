@@ -35,6 +35,8 @@ inline constexpr int kTileLog2 = 4;
 inline constexpr int kTile = 1 << kTileLog2;  // px a side; the unit of work of a thread and of binning
 inline constexpr int kMaxSide = 16384;       // px; larger images are refused
 
+inline constexpr int kMaxMapSide = 4096;     // px; of a UV grid
+
 inline constexpr double kPi = 3.14159265358979323846;
 inline constexpr float kLog2e = 1.44269504088896341f;
 

@@ -1,5 +1,7 @@
 #include "kernels.h"
 
+#include "quantized_layers.h"
+
 #include <cstdlib>
 #include <stdexcept>
 #include <string>
@@ -9,25 +11,37 @@ namespace cap4d {
 
 namespace base {
 extern const Kernels kKernels;
+extern const UnetKernels kUnetKernels;
 }
 #ifdef CAP4D_HAS_X86_VARIANTS
 namespace v3 {
 extern const Kernels kKernels;
+extern const UnetKernels kUnetKernels;
 }
 namespace v4 {
 extern const Kernels kKernels;
+extern const UnetKernels kUnetKernels;
+}
+namespace vnni {
+extern const UnetKernels kUnetKernels;
 }
 #endif
 
 namespace {
 
-const Kernels& choose() {
+// What CAP4D_ISA asks for, the widest by default.
+std::string_view wanted() {
   const char* set = std::getenv("CAP4D_ISA");
-  const std::string_view wish = set && *set ? set : "v4";
-  if (wish != "base" && wish != "v3" && wish != "v4")
-    throw std::invalid_argument("CAP4D_ISA: expected base|v3|v4, got " + std::string(wish));
+  const std::string_view wish = set && *set ? set : "vnni";
+  if (wish != "base" && wish != "v3" && wish != "v4" && wish != "vnni")
+    throw std::invalid_argument("CAP4D_ISA: expected base|v3|v4|vnni, got " + std::string(wish));
+  return wish;
+}
+
+const Kernels& choose() {
+  [[maybe_unused]] const std::string_view wish = wanted();
 #ifdef CAP4D_HAS_X86_VARIANTS
-  const bool no_v4 = wish != "v4", no_v3 = wish == "base";
+  const bool no_v4 = wish == "base" || wish == "v3", no_v3 = wish == "base";
   __builtin_cpu_init();
   // By feature: GCC 11 does not know the levels by name. What else a level holds came with these.
   const bool v3_runs = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");
@@ -39,10 +53,24 @@ const Kernels& choose() {
   return base::kKernels;
 }
 
+const UnetKernels& choose_unet() {
+#ifdef CAP4D_HAS_X86_VARIANTS
+  const std::string_view level = kernels().isa;
+  if (level == "v4") return wanted() == "vnni" && __builtin_cpu_supports("avx512vnni") ? vnni::kUnetKernels : v4::kUnetKernels;
+  if (level == "v3") return v3::kUnetKernels;
+#endif
+  return base::kUnetKernels;
+}
+
 }  // namespace
 
 const Kernels& kernels() {
   static const Kernels& chosen = choose();
+  return chosen;
+}
+
+const UnetKernels& unet_kernels() {
+  static const UnetKernels& chosen = choose_unet();
   return chosen;
 }
 

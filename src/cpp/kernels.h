@@ -5,6 +5,7 @@
 
 #include "camera.h"
 #include "gaussians.h"
+#include "packed.h"
 
 namespace cap4d {
 
@@ -12,6 +13,11 @@ struct Image {  // caller-owned, row major
   float* rgb;    // [H, W, 3] composited on the background
   float* alpha;  // [H, W]
   float* depth;  // [H, W] expected depth m: sum of w_i z_i over alpha, 0 where alpha is 0
+};
+
+struct Image8 {  // caller-owned
+  std::uint8_t* rgba;  // [H, W, 4] rounded
+  bool straight;       // colour divided by alpha, without a background; else composited on it, alpha 255
 };
 
 struct ImageGrad {
@@ -28,10 +34,10 @@ struct TileJob {
   const float* background;  // [3]
 };
 
-// What Gaussian i received in each of its tiles: grads[offsets[i]] up to grads[offsets[i + 1]].
+// What Gaussian i received in each of its tiles: grads[runs[i].first], runs[i].count of them.
 struct PairGrads {
   const SplatGrad* grads;
-  const std::uint32_t* offsets;  // [N + 1]
+  const PairRun* runs;  // [N] where drawn
 };
 
 struct Kernels {
@@ -40,14 +46,20 @@ struct Kernels {
   // and their boxes [end - begin].
   void (*project_fwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii,
                       TileBox* boxes);
+  // The same of prepared Gaussians; begin is a multiple of kPack. frames [faces] where they are bound.
+  void (*project_packed)(const Camera&, const Packed&, const TriangleFrame* frames, std::size_t begin, std::size_t end, Splat* splats,
+                         std::int32_t* radii, TileBox* boxes);
+  // The places of triangles [begin, end) of faces [M, 3] into vertices [G, 3].
+  void (*triangle_frames)(const float* vertices, const std::int32_t* faces, std::size_t begin, std::size_t end, TriangleFrame* frames);
   void (*project_bwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, const std::int32_t* radii, const PairGrads&,
                       const GaussianGrads&);
   void (*rasterize_fwd)(const TileJob&, const Image&);
+  void (*rasterize_rgba8)(const TileJob&, const Image8&);
   // Writes grads[slots[i]] for each i of the job.
   void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t* slots, SplatGrad* grads);
 };
 
-// The widest variant this processor runs; CAP4D_ISA=base|v3|v4 in the environment asks for a narrower one.
+// The widest variant this processor runs; CAP4D_ISA=base|v3|v4|vnni in the environment asks for a narrower one.
 // Throws std::invalid_argument on any other value.
 const Kernels& kernels();
 

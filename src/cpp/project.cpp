@@ -2,7 +2,9 @@
 #include "project.h"
 
 #include <algorithm>
+#include <cstring>
 
+#include "bind.h"
 #include "kernels.h"
 #include "sh.h"
 
@@ -10,6 +12,7 @@ namespace cap4d::CAP4D_ISA {
 
 extern const Kernels kKernels;
 void rasterize_fwd(const TileJob&, const Image&);
+void rasterize_rgba8(const TileJob&, const Image8&);
 void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t*, SplatGrad*);
 
 namespace {
@@ -42,9 +45,9 @@ struct Direction {
   FloatV unit[3], inverse_norm;
 };
 
-CAP4D_INLINE Direction view_direction(const Camera& camera, const Shape3<FloatV>& shape) {
+CAP4D_INLINE Direction view_direction(const Camera& camera, const FloatV* mean) {
   Direction d;
-  for (int i = 0; i < 3; ++i) d.unit[i] = (shape.mean[i] - camera.pivot[i]) - camera.position[i];
+  for (int i = 0; i < 3; ++i) d.unit[i] = (mean[i] - camera.pivot[i]) - camera.position[i];
   const FloatV norm2 = d.unit[0] * d.unit[0] + d.unit[1] * d.unit[1] + d.unit[2] * d.unit[2];
   d.inverse_norm = 1.0f / sqrt(max(norm2, splat(1e-12f)));
   for (int i = 0; i < 3; ++i) d.unit[i] = d.unit[i] * d.inverse_norm;
@@ -64,12 +67,12 @@ CAP4D_INLINE Float4 sh_color(const float* sh, int count, const float basis[][kLa
   return even + odd + basis[last][lane] * Float4{sh[3 * last], sh[3 * last + 1], sh[3 * last + 2], 0.0f};
 }
 
-CAP4D_INLINE bool sane(float channel) { return channel <= kColorMax && channel >= -kColorMax; }  // false for NaN
-
-int radius_of(float xx, float xy, float yy) {
-  const float middle = 0.5f * (xx + yy), half = 0.5f * (xx - yy);
-  const float longest = middle + std::sqrt(half * half + xy * xy);
-  return static_cast<int>(std::min(std::ceil(kRadiusSigmas * std::sqrt(longest)), 1e9f));
+// Three standard deviations along the longest axis, px, rounded up.
+CAP4D_INLINE IntV radius_of(const Footprint<FloatV>& f) {
+  const FloatV middle = 0.5f * (f.xx + f.yy), half = 0.5f * (f.xx - f.yy);
+  const FloatV radius = kRadiusSigmas * sqrt(middle + sqrt(half * half + f.xy * f.xy));
+  const IntV down = __builtin_convertvector(min(radius, splat(1e9f)), IntV);
+  return down + (keep_int(less(__builtin_convertvector(down, FloatV), radius), 1));
 }
 
 // First and last tile of the pixel centres in [low, high] px, a hair too many rather than one too few.
@@ -82,6 +85,48 @@ CAP4D_INLINE TileRange tile_range(FloatV low, FloatV high, int pixels) {
   return {__builtin_convertvector(first, IntV) >> kTileLog2, (__builtin_convertvector(last, IntV) - 1) >> kTileLog2};
 }
 
+// What decides whether and where a Gaussian is drawn: its outline's box.
+struct Extent {
+  FloatV reach, height2, height, width;
+  MaskV drawn;
+};
+
+// `exponent`: log2(opacity).
+CAP4D_INLINE Extent extent_of(const Camera& camera, const Footprint<FloatV>& f, FloatV exponent) {
+  Extent e;
+  // Slightly outside the exact outline: the pixels themselves decide (2 ln 2 per unit of the base-2 exponent).
+  e.reach = 1.38629436f * (exponent - kLog2AlphaMin) + 1e-4f;
+  e.height2 = e.reach * f.yy, e.height = sqrt(e.height2), e.width = sqrt(e.reach * f.xx);
+  const FloatV finite = (f.x + f.y) * 0.0f + f.inv_xx * 0.0f + f.inv_uu * 0.0f + f.shear * 0.0f + f.det * 0.0f + (e.height2 + e.width) * 0.0f;
+  e.drawn = less_equal(splat(0.0f), finite);  // false for NaN
+  e.drawn = both(e.drawn, both(less_equal(splat(kNear), f.depth), less_equal(f.depth, splat(kDepthMax))));
+  e.drawn = both(e.drawn, both(less(splat(0.0f), f.x + e.width), less(f.x - e.width, splat(static_cast<float>(camera.width)))));
+  e.drawn = both(e.drawn, both(less(splat(0.0f), f.y + e.height), less(f.y - e.height, splat(static_cast<float>(camera.height)))));
+  return e;
+}
+
+CAP4D_INLINE MaskV sane(const FloatV* color) {  // false for NaN
+  const FloatV largest = max(max(absolute(color[0]), absolute(color[1])), absolute(color[2]));
+  return both(less_equal(largest, splat(kColorMax)), less_equal(splat(0.0f), (color[0] + color[1] + color[2]) * 0.0f));
+}
+
+// Writes kLanes Gaussians from `first` on, those of `drawn`: splats, radii (0 for the others) and boxes.
+CAP4D_INLINE void put_splats(const Camera& camera, const Footprint<FloatV>& f, const Extent& e, FloatV exponent, const FloatV* color,
+                             std::uint32_t drawn, int count, Splat* splats, std::int32_t* radii, TileBox* boxes) {
+  const FloatV zero = splat(0.0f);
+  const FloatV fields[16] = {f.x, f.y, e.height, f.xy / f.yy, f.shear * e.width, f.det / f.yy * e.reach, 1.0f / e.height2, exponent,
+                             f.inv_xx * (-0.5f * kLog2e), f.inv_uu * (-0.5f * kLog2e), f.shear, max(color[0], zero), max(color[1], zero),
+                             max(color[2], zero), f.depth, zero};
+  store_rows16(fields, &splats->x, drawn);
+  const TileRange columns = tile_range(f.x - e.width, f.x + e.width, camera.width), rows = tile_range(f.y - e.height, f.y + e.height, camera.height);
+  const IntV radius = radius_of(f);
+  for (int l = 0; l < count; ++l) {
+    radii[l] = drawn >> l & 1 ? std::max(radius[l], 1) : 0;
+    boxes[l] = {static_cast<std::int16_t>(columns.first[l]), static_cast<std::int16_t>(columns.last[l]),
+                static_cast<std::int16_t>(rows.first[l]), static_cast<std::int16_t>(rows.last[l])};
+  }
+}
+
 void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin, std::size_t end, Splat* splats, std::int32_t* radii,
                  TileBox* boxes) {
   const int used = (g.sh_degree + 1) * (g.sh_degree + 1);
@@ -92,44 +137,144 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     gather<1>(g.opacities, first, count, &opacity);
     const Footprint<FloatV> f = project(camera, shape).footprint;
     const FloatV exponent = log2_positive(max(opacity, splat(kAlphaMin)));
-    // Slightly outside the exact outline: the pixels themselves decide (2 ln 2 per unit of the base-2 exponent).
-    const FloatV reach = 1.38629436f * (exponent - kLog2AlphaMin) + 1e-4f;
-    const FloatV height2 = reach * f.yy, height = sqrt(height2), width = sqrt(reach * f.xx);
-    const FloatV slope = f.xy / f.yy;
-    const FloatV finite = (f.x + f.y) * 0.0f + f.inv_xx * 0.0f + f.inv_uu * 0.0f + f.shear * 0.0f + f.det * 0.0f +
-                          (height2 + width) * 0.0f + opacity * 0.0f + shape.quat[0] * 0.0f;
-    MaskV drawn = less_equal(splat(0.0f), finite);  // false for NaN
-    drawn = both(drawn, both(less_equal(splat(kNear), f.depth), less_equal(f.depth, splat(kDepthMax))));
-    drawn = both(drawn, less_equal(splat(kAlphaMin), opacity));
-    drawn = both(drawn, both(less(splat(0.0f), f.x + width), less(f.x - width, splat(static_cast<float>(camera.width)))));
-    drawn = both(drawn, both(less(splat(0.0f), f.y + height), less(f.y - height, splat(static_cast<float>(camera.height)))));
-    std::uint32_t todo = bits(drawn) & ((1u << count) - 1);
-    for (int l = 0; l < count; ++l) radii[first + l] = 0;
-    if (!todo) continue;
-
-    const Direction direction = view_direction(camera, shape);
+    const Extent extent = extent_of(camera, f, exponent);
+    const FloatV finite = opacity * 0.0f + shape.quat[0] * 0.0f;
+    const MaskV drawn = both(extent.drawn, both(less_equal(splat(0.0f), finite), less_equal(splat(kAlphaMin), opacity)));
+    const std::uint32_t todo = bits(drawn) & ((1u << count) - 1);
+    if (!todo) {
+      std::fill_n(radii + first, count, 0);
+      continue;
+    }
+    const Direction direction = view_direction(camera, shape.mean);
     FloatV basis_v[kShMax];
     sh_basis(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], basis_v);
-    float basis[kShMax][kLanes];
+    float basis[kShMax][kLanes], colors[3][kLanes] = {};
     for (int k = 0; k < used; ++k) store(basis[k], basis_v[k]);
-    const FloatV fields_v[] = {f.x, f.y, f.inv_xx * (-0.5f * kLog2e), f.inv_uu * (-0.5f * kLog2e), f.shear, exponent, f.depth,
-                               height, slope, f.shear * width, f.det / f.yy * reach, 1.0f / height2, f.xx, f.xy, f.yy};
-    float fields[15][kLanes];
-    spread<15>(fields_v, fields);
-    const TileRange columns = tile_range(f.x - width, f.x + width, camera.width), rows = tile_range(f.y - height, f.y + height, camera.height);
-    for (; todo; todo &= todo - 1) {
-      const int l = __builtin_ctz(todo);
-      const std::size_t id = first + l;
-      const Float4 color = sh_color(g.sh + 3 * g.sh_count * id, used, basis, l);
-      if (!sane(color[0]) || !sane(color[1]) || !sane(color[2])) continue;
-      Splat& s = splats[id];
-      s.x = fields[0][l], s.y = fields[1][l], s.a = fields[2][l], s.c = fields[3][l], s.shear = fields[4][l], s.log2_opacity = fields[5][l];
-      s.red = std::max(color[0], 0.0f), s.green = std::max(color[1], 0.0f), s.blue = std::max(color[2], 0.0f);
-      s.depth = fields[6][l], s.half_height = fields[7][l], s.slope = fields[8][l], s.y_rightmost = fields[9][l];
-      s.half_width2 = fields[10][l], s.inv_height2 = fields[11][l];
-      radii[id] = radius_of(fields[12][l], fields[13][l], fields[14][l]);
-      boxes[id - begin] = {static_cast<std::int16_t>(columns.first[l]), static_cast<std::int16_t>(columns.last[l]),
-                           static_cast<std::int16_t>(rows.first[l]), static_cast<std::int16_t>(rows.last[l])};
+    for (std::uint32_t rest = todo; rest; rest &= rest - 1) {
+      const int l = __builtin_ctz(rest);
+      const Float4 color = sh_color(g.sh + 3 * g.sh_count * (first + l), used, basis, l);
+      for (int c = 0; c < 3; ++c) colors[c][l] = color[c];
+    }
+    const FloatV color[3] = {load(colors[0]), load(colors[1]), load(colors[2])};
+    put_splats(camera, f, extent, exponent, color, todo & bits(sane(color)), count, splats + first, radii + first, boxes + (first - begin));
+  }
+}
+
+// prepared Gaussians ------------------------------------------------------------------------------------------------------------
+
+// Makes rotations times the size of the frames of flat triangles.
+void turn_upright(const float* const* rows, FloatV* frame) {
+  for (int l = 0; l < kLanes; ++l) {
+    TriangleFrame f;
+    std::memcpy(&f, rows[l], sizeof f);
+    if (f.flat == 0) continue;
+    float rotmat[9];
+    upright(f, rotmat);
+    for (int i = 0; i < 9; ++i) frame[i][l] = rotmat[i] * f.size;
+  }
+}
+
+// Local mean and root of kLanes Gaussians to the world, through the frames of their triangles.
+CAP4D_INLINE void to_world(const TriangleFrame* frames, const std::int32_t* binding, FloatV* mean, FloatV root[9]) {
+  const float* rows[kLanes];
+  for (int l = 0; l < kLanes; ++l) rows[l] = frames[binding[l]].turn;
+  FloatV frame[16];
+  load_rows8(rows, frame);
+  const float* rest[kLanes];
+  for (int l = 0; l < kLanes; ++l) rest[l] = rows[l] + 8;
+  load_rows8(rest, frame + 8);
+  const FloatV local[3] = {mean[0], mean[1], mean[2]};
+  for (int i = 0; i < 3; ++i) {
+    const FloatV* turn = frame + 3 * i;
+    mean[i] = turn[0] * local[0] + turn[1] * local[1] + turn[2] * local[2] + frame[9 + i];
+  }
+  if (any(less(splat(0.0f), frame[13]))) [[unlikely]] turn_upright(rows, frame);
+  FloatV turned[9];
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) turned[3 * i + j] = frame[3 * i] * root[j] + frame[3 * i + 1] * root[3 + j] + frame[3 * i + 2] * root[6 + j];
+  std::memcpy(root, turned, sizeof turned);
+}
+
+// 0.5 + sum of basis x coefficients, before the clamp at 0. sh: one block's, from the first of the kLanes on.
+CAP4D_INLINE void packed_color(const PackedHalves* sh, int lane, int count, const FloatV* basis, FloatV* color) {
+  for (int c = 0; c < 3; ++c) color[c] = splat(0.5f);
+  for (int k = 0; k < count; ++k)
+    for (int c = 0; c < 3; ++c) color[c] += basis[k] * load_half(sh[3 * k + c].lane + lane);
+}
+
+void project_packed(const Camera& camera, const Packed& g, const TriangleFrame* frames, std::size_t begin, std::size_t end, Splat* splats,
+                    std::int32_t* radii, TileBox* boxes) {
+  const int degree = g.sh_count == 1 ? 0 : g.sh_count == 4 ? 1 : g.sh_count == 9 ? 2 : 3;
+  for (std::size_t first = begin; first < end; first += kLanes) {
+    const int count = static_cast<int>(std::min<std::size_t>(kLanes, end - first)), lane = static_cast<int>(first % kPack);
+    const PackedFloats* shape = &g.shape[first / kPack * kPackedFields];
+    FloatV mean[3], root[9];
+    for (int i = 0; i < 3; ++i) mean[i] = load(shape[kPackedMean + i].lane + lane);
+    for (int i = 0; i < 9; ++i) root[i] = load(shape[kPackedRoot + i].lane + lane);
+    const FloatV exponent = load(shape[kPackedExponent].lane + lane);
+    if (g.bound()) to_world(frames, &g.binding[first], mean, root);
+    Projection<FloatV> p;
+    FloatV position[2];
+    project_mean(camera, mean, p, position);
+    for (int i = 0; i < 2; ++i)
+      for (int j = 0; j < 3; ++j)
+        p.m[i][j] = p.jacobian_view[i][0] * root[j] + p.jacobian_view[i][1] * root[3 + j] + p.jacobian_view[i][2] * root[6 + j];
+    const Footprint<FloatV> f = footprint(position, p.view[2], p.m);
+    const Extent extent = extent_of(camera, f, exponent);
+    std::uint32_t todo = bits(both(extent.drawn, less_equal(splat(kLog2AlphaMin), exponent))) & ((1u << count) - 1);
+    if (!todo) {
+      std::fill_n(radii + first, count, 0);
+      continue;
+    }
+    const Direction direction = view_direction(camera, mean);
+    FloatV basis[kShMax], color[3];
+    sh_basis(degree, direction.unit[0], direction.unit[1], direction.unit[2], basis);
+    packed_color(&g.sh[first / kPack * 3 * g.sh_count], lane, g.sh_count, basis, color);
+    put_splats(camera, f, extent, exponent, color, todo, count, splats + first, radii + first, boxes + (first - begin));
+  }
+}
+
+CAP4D_INLINE void cross(const FloatV* a, const FloatV* b, FloatV* out) {
+  for (int i = 0; i < 3; ++i) out[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3];
+}
+CAP4D_INLINE FloatV dot(const FloatV* a, const FloatV* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+CAP4D_INLINE void safe_normalize(FloatV* v) {
+  const FloatV inverse = 1.0f / sqrt(max(dot(v, v), splat(kSafeNorm2)));
+  for (int i = 0; i < 3; ++i) v[i] = v[i] * inverse;
+}
+
+// A triangle lower than this part of its side is a sliver, whose normal float32 cannot tell.
+constexpr float kSliver = 1e-2f;
+
+void triangle_frames(const float* vertices, const std::int32_t* faces, std::size_t begin, std::size_t end, TriangleFrame* frames) {
+  for (std::size_t first = begin; first < end; first += kLanes) {
+    const int count = static_cast<int>(std::min<std::size_t>(kLanes, end - first));
+    float lanes[9][kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+      const std::int32_t* face = faces + 3 * (first + (l < count ? l : count - 1));
+      for (int corner = 0; corner < 3; ++corner)
+        for (int i = 0; i < 3; ++i) lanes[3 * corner + i][l] = vertices[3 * face[corner] + i];
+    }
+    FloatV edge[3], side[3], a0[3], a1[3], a2[3], frame[16] = {};
+    for (int i = 0; i < 3; ++i) {
+      const FloatV v0 = load(lanes[i]), v1 = load(lanes[3 + i]), v2 = load(lanes[6 + i]);
+      a0[i] = edge[i] = v1 - v0, side[i] = v2 - v0;
+      frame[9 + i] = v0 + (edge[i] + side[i]) * (1.0f / 3.0f);
+    }
+    safe_normalize(a0);
+    cross(a0, side, a1);
+    const MaskV sound = less(kSliver * kSliver * dot(side, side), dot(a1, a1));  // false for NaN
+    safe_normalize(a1);
+    cross(a0, a1, a2);  // -(a1 x a0)
+    const FloatV height = dot(a2, side);
+    const FloatV size = 0.5f * (sqrt(max(dot(edge, edge), splat(kSafeNorm2))) + max(height, -height));
+    for (int i = 0; i < 3; ++i) frame[3 * i] = size * a0[i], frame[3 * i + 1] = size * a1[i], frame[3 * i + 2] = size * a2[i];
+    frame[12] = size;
+    const std::uint32_t whole = (1u << count) - 1;
+    store_rows16(frame, frames[first].turn, whole & bits(sound));
+    for (std::uint32_t slivers = whole & ~bits(sound); slivers; slivers &= slivers - 1) {
+      const std::size_t id = first + __builtin_ctz(slivers);
+      frames[id] = triangle_frame(vertices, faces + 3 * id);
     }
   }
 }
@@ -137,7 +282,8 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
 // Sum of a Gaussian's per-tile gradients, in the order its tiles were listed.
 CAP4D_INLINE SplatGrad total(const PairGrads& pairs, std::size_t id) {
   SplatGrad sum{};
-  for (std::uint32_t k = pairs.offsets[id]; k < pairs.offsets[id + 1]; ++k) {
+  const PairRun run = pairs.runs[id];
+  for (std::uint32_t k = run.first; k < run.first + run.count; ++k) {
     const SplatGrad& v = pairs.grads[k];
     sum.red += v.red, sum.green += v.green, sum.blue += v.blue, sum.depth += v.depth;
     sum.s += v.s, sum.sx += v.sx, sum.su += v.su, sum.sxx += v.sxx, sum.sxu += v.sxu, sum.suu += v.suu;
@@ -193,7 +339,7 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
                                      0.5f * f.inv_uu * (f.inv_uu * load(received[9]))};
     Shape3<FloatV> v_shape = project_vjp(camera, shape, p, v);
 
-    const Direction direction = view_direction(camera, shape);
+    const Direction direction = view_direction(camera, shape.mean);
     FloatV basis_v[kShMax], v_basis_v[kShMax], v_unit[3];
     sh_basis(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], basis_v);
     float basis[kShMax][kLanes], v_basis[kShMax][kLanes] = {};
@@ -252,6 +398,6 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
 
 }  // namespace
 
-const Kernels kKernels = {CAP4D_NAME(CAP4D_ISA), &project_fwd, &project_bwd, &rasterize_fwd, &rasterize_bwd};
+const Kernels kKernels = {CAP4D_NAME(CAP4D_ISA), &project_fwd, &project_packed, &triangle_frames, &project_bwd, &rasterize_fwd, &rasterize_rgba8, &rasterize_bwd};
 
 }  // namespace cap4d::CAP4D_ISA

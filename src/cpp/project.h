@@ -79,38 +79,51 @@ struct Projection {
   Footprint<T> footprint;
 };
 
+// The mean in the camera and in the image, and the Jacobian of the perspective there.
 template <class T>
-CAP4D_INLINE Projection<T> project(const Camera& camera, const Shape3<T>& g) {
-  Projection<T> p;
-  const T arm[3] = {g.mean[0] - camera.pivot[0], g.mean[1] - camera.pivot[1], g.mean[2] - camera.pivot[2]};
+CAP4D_INLINE void project_mean(const Camera& camera, const T* mean, Projection<T>& p, T* position) {
+  const T arm[3] = {mean[0] - camera.pivot[0], mean[1] - camera.pivot[1], mean[2] - camera.pivot[2]};
   for (int i = 0; i < 3; ++i)
     p.view[i] = camera.rotation[i][0] * arm[0] + camera.rotation[i][1] * arm[1] + camera.rotation[i][2] * arm[2] + camera.translation[i];
   p.inverse_z = 1.0f / p.view[2];
   const T zero = 0.0f * p.inverse_z;
   const float focal[2] = {camera.fx, camera.fy}, centre[2] = {camera.cx, camera.cy};
   const float low[2] = {camera.x_min, camera.y_min}, high[2] = {camera.x_max, camera.y_max};
-  p.inverse_norm = normalize_quat(g.quat, p.unit);
-  quat_to_rotmat(p.unit, p.rotmat);
-  T position[2];
   for (int i = 0; i < 2; ++i) {
     p.ratio[i] = p.view[i] * p.inverse_z;
     p.clamped[i] = min(max(p.ratio[i], zero + low[i]), zero + high[i]);
     position[i] = focal[i] * p.ratio[i] + centre[i];
     const T scale = focal[i] * p.inverse_z, shear = scale * p.clamped[i];
     for (int j = 0; j < 3; ++j) p.jacobian_view[i][j] = scale * camera.rotation[i][j] - shear * camera.rotation[2][j];
-    for (int j = 0; j < 3; ++j) {
-      p.q[i][j] = p.jacobian_view[i][0] * p.rotmat[0][j] + p.jacobian_view[i][1] * p.rotmat[1][j] + p.jacobian_view[i][2] * p.rotmat[2][j];
-      p.m[i][j] = p.q[i][j] * g.scale[j];
-    }
   }
-  const T *m0 = p.m[0], *m1 = p.m[1];
+}
+
+// position [2] px, depth m; the covariance without the low-pass is m m^T.
+template <class T>
+CAP4D_INLINE Footprint<T> footprint(const T* position, T depth, const T m[2][3]) {
+  const T *m0 = m[0], *m1 = m[1];
   const T xx = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2], yy = m1[0] * m1[0] + m1[1] * m1[1] + m1[2] * m1[2];
   const T xy = m0[0] * m1[0] + m0[1] * m1[1] + m0[2] * m1[2];
   // det(m m^T) as a sum of squares (Cauchy-Binet): xx yy - xy^2 would cancel for needles.
   const T c0 = m0[1] * m1[2] - m0[2] * m1[1], c1 = m0[2] * m1[0] - m0[0] * m1[2], c2 = m0[0] * m1[1] - m0[1] * m1[0];
   const T det = c0 * c0 + c1 * c1 + c2 * c2 + kLowPass * (xx + yy) + kLowPass * kLowPass;
   const T wide_xx = xx + kLowPass;
-  p.footprint = {position[0], position[1], p.view[2], wide_xx, xy, yy + kLowPass, 1.0f / wide_xx, wide_xx / det, xy / wide_xx, det};
+  return {position[0], position[1], depth, wide_xx, xy, yy + kLowPass, 1.0f / wide_xx, wide_xx / det, xy / wide_xx, det};
+}
+
+template <class T>
+CAP4D_INLINE Projection<T> project(const Camera& camera, const Shape3<T>& g) {
+  Projection<T> p;
+  T position[2];
+  project_mean(camera, g.mean, p, position);
+  p.inverse_norm = normalize_quat(g.quat, p.unit);
+  quat_to_rotmat(p.unit, p.rotmat);
+  for (int i = 0; i < 2; ++i)
+    for (int j = 0; j < 3; ++j) {
+      p.q[i][j] = p.jacobian_view[i][0] * p.rotmat[0][j] + p.jacobian_view[i][1] * p.rotmat[1][j] + p.jacobian_view[i][2] * p.rotmat[2][j];
+      p.m[i][j] = p.q[i][j] * g.scale[j];
+    }
+  p.footprint = footprint(position, p.view[2], p.m);
   return p;
 }
 

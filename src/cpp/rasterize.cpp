@@ -1,10 +1,13 @@
 // One tile's pixels from its Gaussians, near to far, and the gradient of that. Compiled once per instruction set.
 //
-// A tile is cut into blocks of 4 columns by kLanes / 4 rows, one register each; the tile's state stays in the first-level cache.
-// Gaussians are the outer loop: each touches only the blocks that its outline meets and that are not finished.
-// Both passes walk near to far. The gradient needs, for each Gaussian at each pixel, what lies behind it: that is the pixel's
+// A tile is cut into blocks of 4 columns by kLanes / 4 rows, one register each. Its list is taken in chunks that fit the first-level
+// cache: first the outlines of a chunk are met with the blocks, kLanes Gaussians at a time; then the blocks are drawn. Forward, each
+// block walks its own Gaussians with its pixels in registers and leaves when they are finished. Backward, each Gaussian walks its
+// blocks with its sums in registers.
+// Both passes go near to far. The gradient needs, for each Gaussian at each pixel, what lies behind it: that is the pixel's
 // total less what has been passed, so nothing per pixel has to be kept from the forward pass but its image.
 #include <algorithm>
+#include <cstddef>
 #include <cstring>
 
 #include "constants.h"
@@ -14,7 +17,7 @@
 namespace cap4d::CAP4D_ISA {
 namespace {
 
-// Blocks are numbered down the columns, so that one register holds the bands of a column (or of several).
+// Blocks are numbered down the columns.
 constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlockColumns = kTile / kBlockWidth, kBands = kTile / kBlockHeight, kBlocks = kBlockColumns * kBands;
 static_assert(kBlocks <= 64);
@@ -43,8 +46,14 @@ CAP4D_INLINE Pixel pixel_of(const TileJob& job, int block, int lane) {
 
 CAP4D_INLINE bool inside(const TileJob& job, Pixel p) { return p.x < job.camera->width && p.y < job.camera->height; }
 
+CAP4D_INLINE bool whole(const TileJob& job) { return job.x0 + kTile <= job.camera->width && job.y0 + kTile <= job.camera->height; }
+
 // Transmittance 1 in the image; outside it a pixel is finished from the start (finished = negative).
 BlockSet open_pixels(const TileJob& job, FloatV* transmittance) {
+  if (whole(job)) {
+    for (int block = 0; block < kBlocks; ++block) transmittance[block] = splat(1.0f);
+    return kBlocks == 64 ? ~BlockSet{0} : (BlockSet{1} << kBlocks % 64) - 1;
+  }
   BlockSet open = 0;
   for (int block = 0; block < kBlocks; ++block)
     for (int l = 0; l < kLanes; ++l) {
@@ -55,108 +64,246 @@ BlockSet open_pixels(const TileJob& job, FloatV* transmittance) {
   return open;
 }
 
-struct Bands {  // first pixel centre of the band and of the column of block l, relative to the tile
-  float y[kLanes], x[kLanes];
+// Which of a chunk's Gaussians meet which blocks: `blocks[b]` has a bit per Gaussian, `gaussians[i]` a bit per block.
+constexpr int kChunk = 256, kWords = kChunk / 64;
+struct Meetings {
+  std::uint64_t blocks[kBlocks][kWords];
+  BlockSet gaussians[kChunk];
 };
-constexpr Bands kBand = [] {
-  Bands bands{};
-  for (int l = 0; l < kLanes; ++l) bands.y[l] = l % kBands * kBlockHeight + 0.5f, bands.x[l] = l / kBands * kBlockWidth + 0.5f;
-  return bands;
-}();
 
-// Blocks that the outline of `s` meets, exact for their pixel centres' rows and columns: the widest chord of an ellipse within a
-// band is at its extreme point, or at the row of the band nearest to that.
-CAP4D_INLINE BlockSet touched_blocks(const Splat& s, int x0, int y0) {
-  constexpr int kColumnsAtOnce = kLanes > kBands ? kLanes / kBands : 1, kGroups = kBands > kLanes ? kBands / kLanes : 1;
-  BlockSet touched = 0;
-  const FloatV height = splat(s.half_height), rightmost = splat(s.y_rightmost), zero = splat(0.0f);
-  const float x = s.x - x0, y = s.y - y0;
-  for (int group = 0; group < kGroups; ++group) {
-    const FloatV first_row = load(kBand.y) + (group * kLanes * kBlockHeight - y);
-    const FloatV low = max(first_row, -height), high = min(first_row + (kBlockHeight - 1.0f), height);
+struct Outlines {  // of kLanes Gaussians; in the order of Splat
+  FloatV x, y, half_height, slope, y_rightmost, half_width2, inv_height2;
+};
+
+// Splats lie in memory in the caller's order: ask for them before they are needed.
+constexpr std::size_t kPrefetch = 2 * kLanes;
+
+CAP4D_INLINE Outlines gather_outlines(const TileJob& job, std::size_t first, int count) {
+  const float* rows[kLanes];
+  for (int l = 0; l < kLanes; ++l) {
+    const std::size_t i = first + (l < count ? l : count - 1);
+    if (i + kPrefetch < job.count) __builtin_prefetch(&job.splats[job.isects[i + kPrefetch]]);
+    rows[l] = &job.splats[job.isects[i]].x;
+  }
+  FloatV fields[8];
+  load_rows8(rows, fields);
+  Outlines outlines;
+  static_assert(sizeof outlines == 7 * sizeof(FloatV) && offsetof(Splat, inv_height2) == 6 * sizeof(float));
+  std::memcpy(&outlines, fields, sizeof outlines);
+  return outlines;
+}
+
+// Blocks that an outline meets, exact for their pixel centres' rows and columns: the widest chord of an ellipse within a band is at
+// its extreme point, or at the row of the band nearest to that. `note` takes (block, which of the kLanes Gaussians).
+template <class Note>
+CAP4D_INLINE void meet_blocks(const Outlines& s, int x0, int y0, const Note& note) {
+  const FloatV zero = splat(0.0f), x = s.x - static_cast<float>(x0), y = s.y - static_cast<float>(y0);
+  for (int band = 0; band < kBands; ++band) {
+    const FloatV first_row = (band * kBlockHeight + 0.5f) - y;
+    const FloatV low = max(first_row, -s.half_height), high = min(first_row + (kBlockHeight - 1.0f), s.half_height);
     const MaskV crossed = less_equal(low, high);
-    const FloatV right = min(max(rightmost, low), high), left = min(max(-rightmost, low), high);
+    const FloatV right = min(max(s.y_rightmost, low), high), left = min(max(-s.y_rightmost, low), high);
     const FloatV half_right = sqrt(s.half_width2 * max(1.0f - right * right * s.inv_height2, zero));
     const FloatV half_left = sqrt(s.half_width2 * max(1.0f - left * left * s.inv_height2, zero));
     const FloatV first = s.slope * left - half_left + x, last = s.slope * right + half_right + x;
-    for (int column = 0; column < kBlockColumns; column += kColumnsAtOnce) {
-      const FloatV centre = load(kBand.x) + column * static_cast<float>(kBlockWidth);
-      const MaskV met = both(crossed, both(less_equal(first, centre + (kBlockWidth - 1.0f)), less_equal(centre, last)));
-      touched |= static_cast<BlockSet>(bits(met)) << (column * kBands + group * kLanes);
+    for (int column = 0; column < kBlockColumns; ++column) {
+      const float centre = column * kBlockWidth + 0.5f;
+      const MaskV met = less_equal_in(less_equal_in(crossed, first, splat(centre + (kBlockWidth - 1))), splat(centre), last);
+      note(column * kBands + band, bits(met));
     }
   }
-  return touched;
 }
 
+enum class Order { kByBlock, kByGaussian };
+
+// Meets Gaussians [begin, begin + count) of the tile with its blocks; fills one side of `meetings`.
+template <Order kOrder>
+void meet(const TileJob& job, std::size_t begin, int count, Meetings& meetings) {
+  if constexpr (kOrder == Order::kByBlock) std::memset(meetings.blocks, 0, sizeof meetings.blocks);
+  else std::memset(meetings.gaussians, 0, count * sizeof(BlockSet));
+  for (int first = 0; first < count; first += kLanes) {
+    const int some = std::min(kLanes, count - first);
+    const std::uint32_t real = (1u << some) - 1;
+    meet_blocks(gather_outlines(job, begin + first, some), job.x0, job.y0, [&](int block, std::uint32_t met) {
+      met &= real;
+      if constexpr (kOrder == Order::kByBlock) {
+        meetings.blocks[block][first / 64] |= std::uint64_t{met} << first % 64;
+      } else {
+        for (; met; met &= met - 1) meetings.gaussians[first + __builtin_ctz(met)] |= BlockSet{1} << block;
+      }
+    });
+  }
+}
+
+// The exponent of alpha at a block's pixels, base 2; never above log2_opacity.
+struct Place {
+  FloatV dx, u;  // from the centre, sheared
+};
+CAP4D_INLINE FloatV exponent_at(const Splat& s, FloatV x, FloatV y, Place& at) {
+  at.dx = x - s.x;
+  at.u = (y - s.y) - s.shear * at.dx;
+  return s.c * at.u * at.u + (s.a * at.dx * at.dx + s.log2_opacity);
+}
+
+// forward -----------------------------------------------------------------------------------------------------------------------
+
+// Alpha is summed where depth is divided by it: 1 - transmittance has no digits left where little is seen.
+template <bool kDepth>
+struct BlockSums {
+  FloatV transmittance, red, green, blue, alpha, depth;
+};
+template <>
+struct BlockSums<false> {
+  FloatV transmittance, red, green, blue;
+};
+
+// Draws a chunk into a block; false when its pixels are finished.
+template <bool kDepth>
+CAP4D_INLINE bool draw_block(const TileJob& job, std::size_t begin, const std::uint64_t* words, int block, BlockSums<kDepth>& sums) {
+  const FloatV x = load(kPixel.x) + static_cast<float>(job.x0 + block_x(block)), y = load(kPixel.y) + static_cast<float>(job.y0 + block_y(block));
+  BlockSums<kDepth> b = sums;
+  MaskV open = less(splat(0.0f), b.transmittance);
+  b.transmittance = max(b.transmittance, -b.transmittance);
+  bool going = true;
+  for (int w = 0; w < kWords && going; ++w)
+    for (std::uint64_t word = words[w]; word; word &= word - 1) {
+      const Splat& s = job.splats[job.isects[begin + 64 * w + __builtin_ctzll(word)]];
+      Place at;
+      const FloatV exponent = exponent_at(s, x, y, at);
+      const MaskV visible = less_equal_in(open, splat(kLog2AlphaMin), exponent);
+      const FloatV alpha = keep(visible, min(exp2_in_range(exponent), splat(kAlphaMax)));
+      FloatV weight = alpha * b.transmittance, next = b.transmittance - weight;
+      const MaskV stop = less(next, splat(kTransmittanceMin));  // an open pixel: what is finished stands above
+      if (any(stop)) [[unlikely]] {
+        open = first_only(open, stop);
+        weight = select(stop, splat(0.0f), weight);
+        next = select(stop, b.transmittance, next);
+        going = any(open);
+      }
+      b.red += weight * s.red;
+      b.green += weight * s.green;
+      b.blue += weight * s.blue;
+      if constexpr (kDepth) {
+        b.alpha += weight;
+        b.depth += weight * s.depth;
+      }
+      b.transmittance = next;
+      if (!going) break;
+    }
+  sums = b;
+  sums.transmittance = select(open, b.transmittance, -b.transmittance);
+  return going;
+}
+
+template <bool kDepth>
+void draw_tile(const TileJob& job, BlockSums<kDepth>* sums) {
+  FloatV transmittance[kBlocks];
+  BlockSet open = open_pixels(job, transmittance);
+  for (int block = 0; block < kBlocks; ++block) sums[block] = BlockSums<kDepth>{}, sums[block].transmittance = transmittance[block];
+  Meetings meetings;
+  for (std::size_t begin = 0; begin < job.count && open; begin += kChunk) {
+    meet<Order::kByBlock>(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), meetings);
+    for (BlockSet todo = open; todo; todo &= todo - 1) {
+      const int block = __builtin_ctzll(todo);
+      if (!draw_block<kDepth>(job, begin, meetings.blocks[block], block, sums[block])) open &= ~(BlockSet{1} << block);
+    }
+  }
+  for (int block = 0; block < kBlocks; ++block) sums[block].transmittance = max(sums[block].transmittance, -sums[block].transmittance);
+}
+
+// Calls write(pixel's index in the image, lane) for the pixels of a block that are in the image.
+template <class Write>
+CAP4D_INLINE void each_pixel(const TileJob& job, int block, const Write& write) {
+  const std::size_t width = job.camera->width;
+  if (whole(job)) {
+    const std::size_t corner = (job.y0 + block_y(block)) * width + job.x0 + block_x(block);
+    for (int l = 0; l < kLanes; ++l) write(corner + l / kBlockWidth * width + l % kBlockWidth, l);
+    return;
+  }
+  for (int l = 0; l < kLanes; ++l) {
+    const Pixel p = pixel_of(job, block, l);
+    if (inside(job, p)) write(p.y * width + p.x, l);
+  }
+}
+
+}  // namespace
+
+void rasterize_fwd(const TileJob& job, const Image& image) {
+  BlockSums<true> sums[kBlocks];
+  draw_tile(job, sums);
+  for (int block = 0; block < kBlocks; ++block) {
+    const BlockSums<true>& b = sums[block];
+    const FloatV depth = keep(less(splat(0.0f), b.alpha), b.depth / b.alpha);
+    const float* background = job.background;
+    float rgb[3][kLanes], alphas[kLanes], depths[kLanes];
+    store(rgb[0], b.red + b.transmittance * background[0]);
+    store(rgb[1], b.green + b.transmittance * background[1]);
+    store(rgb[2], b.blue + b.transmittance * background[2]);
+    store(alphas, min(b.alpha, splat(1.0f)));
+    store(depths, depth);
+    each_pixel(job, block, [&](std::size_t at, int l) {
+      for (int c = 0; c < 3; ++c) image.rgb[3 * at + c] = rgb[c][l];
+      image.alpha[at] = alphas[l];
+      image.depth[at] = depths[l];
+    });
+  }
+}
+
+namespace {
+
+// [0, 1] -> 0 to 255, rounded; what is outside is clamped.
+CAP4D_INLINE IntV byte_of(FloatV v) {
+  return __builtin_convertvector(min(max(v, splat(0.0f)), splat(1.0f)) * 255.0f + 0.5f, IntV);
+}
+
+}  // namespace
+
+void rasterize_rgba8(const TileJob& job, const Image8& image) {
+  BlockSums<false> sums[kBlocks];
+  draw_tile(job, sums);
+  for (int block = 0; block < kBlocks; ++block) {
+    const BlockSums<false>& b = sums[block];
+    FloatV color[3] = {b.red, b.green, b.blue}, alpha = splat(1.0f);
+    if (image.straight) {
+      alpha = 1.0f - b.transmittance;
+      for (FloatV& c : color) c = c / max(alpha, splat(1e-6f));
+    } else {
+      for (int c = 0; c < 3; ++c) color[c] = color[c] + b.transmittance * job.background[c];
+    }
+    const IntV packed = byte_of(color[0]) | byte_of(color[1]) << 8 | byte_of(color[2]) << 16 | byte_of(alpha) << 24;
+    std::uint32_t pixels[kLanes];
+    std::memcpy(pixels, &packed, sizeof pixels);
+    each_pixel(job, block, [&](std::size_t at, int l) { std::memcpy(image.rgba + 4 * at, &pixels[l], 4); });
+  }
+}
+
+// backward ----------------------------------------------------------------------------------------------------------------------
+
+namespace {
+
 struct Contribution {  // of one Gaussian to the pixels of one block
-  FloatV dx, u, alpha, density, weight, next;
+  FloatV alpha, density, weight, next;
+  Place at;
   MaskV visible, stop;
 };
 
 // False where nothing of the block is visible. `visible`: alpha >= 1/255 and the pixel open; `stop`: this one would finish it.
 CAP4D_INLINE bool contribute(const Splat& s, const TileJob& job, int block, FloatV transmittance, Contribution& c) {
-  c.dx = load(kPixel.x) + (job.x0 + block_x(block) - s.x);
-  c.u = load(kPixel.y) + (job.y0 + block_y(block) - s.y) - s.shear * c.dx;
-  const FloatV exponent = s.c * c.u * c.u + (s.a * c.dx * c.dx + s.log2_opacity);  // never above log2_opacity
-  c.visible = both(less_equal(splat(kLog2AlphaMin), exponent), less(splat(0.0f), transmittance));
+  const FloatV x = load(kPixel.x) + static_cast<float>(job.x0 + block_x(block)), y = load(kPixel.y) + static_cast<float>(job.y0 + block_y(block));
+  const FloatV exponent = exponent_at(s, x, y, c.at);
+  c.visible = less_equal_in(less(splat(0.0f), transmittance), splat(kLog2AlphaMin), exponent);
   if (!any(c.visible)) return false;
-  c.density = exp2_nonpositive(exponent);
-  c.alpha = min(c.density, splat(kAlphaMax));
+  c.density = exp2_in_range(exponent);
+  c.alpha = keep(c.visible, min(c.density, splat(kAlphaMax)));
   c.weight = c.alpha * transmittance;
   c.next = transmittance - c.weight;
   c.stop = both(c.visible, less(c.next, splat(kTransmittanceMin)));
   c.weight = keep(first_only(c.visible, c.stop), c.weight);
-  c.next = select(c.stop, -transmittance, select(c.visible, c.next, transmittance));
+  c.next = select(c.stop, -transmittance, c.next);
   return true;
 }
 
-// Splats lie in memory in the caller's order: ask for them before they are needed.
-constexpr std::size_t kPrefetch = 12;
-CAP4D_INLINE const Splat& splat_at(const TileJob& job, std::size_t i) {
-  if (i + kPrefetch < job.count) __builtin_prefetch(&job.splats[job.isects[i + kPrefetch]]);
-  return job.splats[job.isects[i]];
-}
-
 CAP4D_INLINE bool finished(FloatV transmittance) { return !any(less(splat(0.0f), transmittance)); }
-
-}  // namespace
-
-void rasterize_fwd(const TileJob& job, const Image& image) {
-  // Alpha is summed: 1 - transmittance has no digits left where little is seen, and depth is divided by it.
-  FloatV transmittance[kBlocks], red[kBlocks] = {}, green[kBlocks] = {}, blue[kBlocks] = {}, alpha[kBlocks] = {}, depth[kBlocks] = {};
-  BlockSet open = open_pixels(job, transmittance);
-  for (std::size_t i = 0; i < job.count && open; ++i) {
-    const Splat& s = splat_at(job, i);
-    for (BlockSet todo = open & touched_blocks(s, job.x0, job.y0); todo; todo &= todo - 1) {
-      const int block = __builtin_ctzll(todo);
-      Contribution c;
-      if (!contribute(s, job, block, transmittance[block], c)) continue;
-      red[block] += c.weight * s.red;
-      green[block] += c.weight * s.green;
-      blue[block] += c.weight * s.blue;
-      alpha[block] += c.weight;
-      depth[block] += c.weight * s.depth;
-      transmittance[block] = c.next;
-      if (any(c.stop) && finished(c.next)) open &= ~(BlockSet{1} << block);
-    }
-  }
-  const std::size_t width = job.camera->width;
-  for (int block = 0; block < kBlocks; ++block)
-    for (int l = 0; l < kLanes; ++l) {
-      const Pixel p = pixel_of(job, block, l);
-      if (!inside(job, p)) continue;
-      const std::size_t at = p.y * width + p.x;
-      const float t = transmittance[block][l] < 0 ? -transmittance[block][l] : transmittance[block][l];
-      image.rgb[3 * at] = red[block][l] + t * job.background[0];
-      image.rgb[3 * at + 1] = green[block][l] + t * job.background[1];
-      image.rgb[3 * at + 2] = blue[block][l] + t * job.background[2];
-      const float a = alpha[block][l];
-      image.alpha[at] = a < 1.0f ? a : 1.0f;
-      image.depth[at] = a > 0.0f ? depth[block][l] / a : 0.0f;
-    }
-}
-
-namespace {
 
 struct PixelGrads {  // dL/d of what a pixel accumulates: per Gaussian it adds weight * (rgb . c + constant + depth * z)
   FloatV red[kBlocks], green[kBlocks], blue[kBlocks], depth[kBlocks], constant[kBlocks];
@@ -194,9 +341,11 @@ template <bool kDepth>
 void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32_t* slots, SplatGrad* pair_grads) {
   FloatV transmittance[kBlocks];
   BlockSet open = open_pixels(job, transmittance);
+  Meetings meetings;
   for (std::size_t i = 0; i < job.count; ++i) {
-    const Splat& s = splat_at(job, i);
-    BlockSet todo = open ? open & touched_blocks(s, job.x0, job.y0) : 0;
+    if (i % kChunk == 0 && open) meet<Order::kByGaussian>(job, i, static_cast<int>(std::min<std::size_t>(kChunk, job.count - i)), meetings);
+    const Splat& s = job.splats[job.isects[i]];
+    BlockSet todo = open ? open & meetings.gaussians[i % kChunk] : 0;
     FloatV v_red{}, v_green{}, v_blue{}, v_depth{}, v_s{}, v_sx{}, v_su{}, v_sxx{}, v_sxu{}, v_suu{};
     bool touched = false;
     for (; todo; todo &= todo - 1) {
@@ -214,13 +363,13 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
       v_green += c.weight * grads.green[block];
       v_blue += c.weight * grads.blue[block];
       if constexpr (kDepth) v_depth += c.weight * grads.depth[block];
-      const FloatV sx = ds * c.dx, su = ds * c.u;
+      const FloatV sx = ds * c.at.dx, su = ds * c.at.u;
       v_s += ds;
       v_sx += sx;
       v_su += su;
-      v_sxx += sx * c.dx;
-      v_sxu += sx * c.u;
-      v_suu += su * c.u;
+      v_sxx += sx * c.at.dx;
+      v_sxu += sx * c.at.u;
+      v_suu += su * c.at.u;
       grads.behind[block] = behind;
       transmittance[block] = c.next;
       if (any(c.stop) && finished(c.next)) open &= ~(BlockSet{1} << block);

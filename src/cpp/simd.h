@@ -55,8 +55,10 @@ CAP4D_INLINE MaskV less(FloatV a, FloatV b) { return _mm512_cmp_ps_mask(a, b, _C
 CAP4D_INLINE MaskV less_equal(FloatV a, FloatV b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
 CAP4D_INLINE FloatV select(MaskV m, FloatV yes, FloatV no) { return _mm512_mask_blend_ps(m, no, yes); }
 CAP4D_INLINE FloatV keep(MaskV m, FloatV v) { return _mm512_maskz_mov_ps(m, v); }
+CAP4D_INLINE IntV keep_int(MaskV m, int v) { return reinterpret_cast<IntV>(_mm512_maskz_set1_epi32(m, v)); }
 CAP4D_INLINE std::uint32_t bits(MaskV m) { return m; }
 CAP4D_INLINE MaskV both(MaskV a, MaskV b) { return static_cast<MaskV>(a & b); }
+CAP4D_INLINE MaskV less_equal_in(MaskV where, FloatV a, FloatV b) { return _mm512_mask_cmp_ps_mask(where, a, b, _CMP_LE_OQ); }
 CAP4D_INLINE MaskV first_only(MaskV a, MaskV b) { return static_cast<MaskV>(a & ~b); }
 CAP4D_INLINE FloatV sqrt(FloatV v) { return _mm512_sqrt_ps(v); }
 CAP4D_INLINE FloatV min(FloatV a, FloatV b) { return _mm512_min_ps(a, b); }
@@ -67,8 +69,10 @@ CAP4D_INLINE MaskV less(FloatV a, FloatV b) { return a < b; }
 CAP4D_INLINE MaskV less_equal(FloatV a, FloatV b) { return a <= b; }
 CAP4D_INLINE FloatV select(MaskV m, FloatV yes, FloatV no) { return m ? yes : no; }
 CAP4D_INLINE FloatV keep(MaskV m, FloatV v) { return as_float(m & as_int(v)); }
+CAP4D_INLINE IntV keep_int(MaskV m, int v) { return m & v; }
 CAP4D_INLINE MaskV both(MaskV a, MaskV b) { return a & b; }
 CAP4D_INLINE MaskV first_only(MaskV a, MaskV b) { return a & ~b; }
+CAP4D_INLINE MaskV less_equal_in(MaskV where, FloatV a, FloatV b) { return where & (a <= b); }
 #ifdef __AVX2__
 CAP4D_INLINE std::uint32_t bits(MaskV m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(as_float(m))); }
 CAP4D_INLINE FloatV sqrt(FloatV v) { return _mm256_sqrt_ps(v); }
@@ -91,17 +95,28 @@ CAP4D_INLINE FloatV max(FloatV a, FloatV b) { return a > b ? a : b; }
 
 CAP4D_INLINE bool any(MaskV m) { return bits(m) != 0; }
 
-// 2^x for x <= 0, relative error below 3e-7: a degree 5 minimax polynomial on [-0.5, 0.5], the integer added to the exponent.
-CAP4D_INLINE FloatV exp2_nonpositive(FloatV x) {
-  x = max(x, splat(-125.0f));
+// 2^x for x in [-125, 126], relative error below 2e-7: a degree 5 minimax polynomial (relative, by linear programming) on one
+// octave, the integer added to the exponent. Beyond, and for NaN, rubbish.
+CAP4D_INLINE FloatV exp2_in_range(FloatV x) {
+#ifdef CAP4D_AVX512
+  constexpr int kFloor = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+  const FloatV f = _mm512_reduce_ps(x, kFloor);  // x - floor(x)
+  FloatV p = f * 1.881429651e-3f + 8.980025032e-3f;
+  p = p * f + 5.583399171e-2f;
+  p = p * f + 2.401512769e-1f;
+  p = p * f + 6.931532616e-1f;
+  p = p * f + 9.999999346e-1f;
+  return _mm512_scalef_ps(p, x);
+#else
   const FloatV shifted = x + 12582912.0f;  // 1.5 * 2^23: the low mantissa bits now hold round(x)
   const FloatV f = x - (shifted - 12582912.0f);
-  FloatV p = f * 1.327647154e-3f + 9.675541352e-3f;
-  p = p * f + 5.550713275e-2f;
-  p = p * f + 2.402211972e-1f;
-  p = p * f + 6.931469671e-1f;
-  p = p * f + 1.000000072f;
+  FloatV p = f * 1.327692934e-3f + 9.675559861e-3f;
+  p = p * f + 5.550711605e-2f;
+  p = p * f + 2.402211987e-1f;
+  p = p * f + 6.93146969e-1f;
+  p = p * f + 1.000000071f;
   return as_float(as_int(p) + (as_int(shifted) << 23));
+#endif
 }
 
 // log2(x) for normal x > 0, absolute error below 2e-7 near 1 (Cephes logf).
@@ -120,6 +135,77 @@ CAP4D_INLINE FloatV log2_positive(FloatV x) {
   p = p * f + 3.3333331174e-1f;
   p = p * f * z - 0.5f * z;
   return (f + p) * 1.44269504088896341f + __builtin_convertvector(exponent, FloatV);
+}
+
+// kLanes IEEE 754 half floats, none infinite or NaN.
+CAP4D_INLINE FloatV load_half(const std::uint16_t* p) {
+#ifdef CAP4D_AVX512
+  return _mm512_cvtph_ps(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(p)));
+#elif defined(__F16C__)
+  return _mm256_cvtph_ps(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p)));
+#else
+  IntV half;
+  for (int i = 0; i < kLanes; ++i) half[i] = p[i];
+  // Exponent and mantissa in place are the number over 2^112, denormals too.
+  const FloatV magnitude = as_float((half & 0x7fff) << 13) * 0x1p112f;
+  return as_float(as_int(magnitude) | (half & 0x8000) << 16);
+#endif
+}
+
+// Turns 16 registers into rows of 16 floats (a row per lane): row l gets lane l of each. Only rows whose bit is set are written.
+CAP4D_INLINE void store_rows16(const FloatV* columns, float* rows, std::uint32_t which) {
+#ifdef CAP4D_AVX512
+  __m512 a[16], b[16];
+  for (int i = 0; i < 16; i += 4) {  // 4 x 4 within the 128-bit lanes
+    const __m512 lo0 = _mm512_unpacklo_ps(columns[i], columns[i + 1]), hi0 = _mm512_unpackhi_ps(columns[i], columns[i + 1]);
+    const __m512 lo1 = _mm512_unpacklo_ps(columns[i + 2], columns[i + 3]), hi1 = _mm512_unpackhi_ps(columns[i + 2], columns[i + 3]);
+    a[i] = _mm512_shuffle_ps(lo0, lo1, 0x44), a[i + 1] = _mm512_shuffle_ps(lo0, lo1, 0xee);
+    a[i + 2] = _mm512_shuffle_ps(hi0, hi1, 0x44), a[i + 3] = _mm512_shuffle_ps(hi0, hi1, 0xee);
+  }
+  for (int j = 0; j < 4; ++j) {  // a[4 i + j] holds columns 4 i.. of rows j, 4 + j, 8 + j, 12 + j
+    b[j] = _mm512_shuffle_f32x4(a[j], a[4 + j], 0x44), b[4 + j] = _mm512_shuffle_f32x4(a[j], a[4 + j], 0xee);
+    b[8 + j] = _mm512_shuffle_f32x4(a[8 + j], a[12 + j], 0x44), b[12 + j] = _mm512_shuffle_f32x4(a[8 + j], a[12 + j], 0xee);
+  }
+  for (int j = 0; j < 4; ++j) {
+    const __m512 row[4] = {_mm512_shuffle_f32x4(b[j], b[8 + j], 0x88), _mm512_shuffle_f32x4(b[j], b[8 + j], 0xdd),
+                           _mm512_shuffle_f32x4(b[4 + j], b[12 + j], 0x88), _mm512_shuffle_f32x4(b[4 + j], b[12 + j], 0xdd)};
+    for (int k = 0; k < 4; ++k)
+      if (which >> (4 * k + j) & 1) _mm512_storeu_ps(rows + 16 * (4 * k + j), row[k]);
+  }
+#else
+  float lanes[16][kLanes];
+  for (int c = 0; c < 16; ++c) store(lanes[c], columns[c]);
+  for (; which; which &= which - 1) {
+    const int l = __builtin_ctz(which);
+    for (int c = 0; c < 16; ++c) rows[16 * l + c] = lanes[c][l];
+  }
+#endif
+}
+
+// The first 8 floats of kLanes rows as 8 registers.
+CAP4D_INLINE void load_rows8(const float* const* rows, FloatV* columns) {
+#ifdef CAP4D_AVX512
+  __m512 z[8], t[8];
+  for (int i = 0; i < 8; ++i) {  // rows i and i + 4 of each half of the rows
+    const int row = i < 4 ? i : i + 4;
+    z[i] = _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(rows[row])), _mm256_loadu_ps(rows[row + 4]), 1);
+  }
+  for (int i = 0; i < 8; i += 4) {
+    const __m512 lo0 = _mm512_unpacklo_ps(z[i], z[i + 1]), hi0 = _mm512_unpackhi_ps(z[i], z[i + 1]);
+    const __m512 lo1 = _mm512_unpacklo_ps(z[i + 2], z[i + 3]), hi1 = _mm512_unpackhi_ps(z[i + 2], z[i + 3]);
+    t[i] = _mm512_shuffle_ps(lo0, lo1, 0x44), t[i + 1] = _mm512_shuffle_ps(lo0, lo1, 0xee);
+    t[i + 2] = _mm512_shuffle_ps(hi0, hi1, 0x44), t[i + 3] = _mm512_shuffle_ps(hi0, hi1, 0xee);
+  }
+  for (int c = 0; c < 4; ++c) {
+    columns[c] = _mm512_shuffle_f32x4(t[c], t[4 + c], 0x88);
+    columns[4 + c] = _mm512_shuffle_f32x4(t[c], t[4 + c], 0xdd);
+  }
+#else
+  float lanes[8][kLanes];
+  for (int l = 0; l < kLanes; ++l)
+    for (int c = 0; c < 8; ++c) lanes[c][l] = rows[l][c];
+  for (int c = 0; c < 8; ++c) columns[c] = load(lanes[c]);
+#endif
 }
 
 // Sum of the lanes, in a fixed order.

@@ -1,14 +1,9 @@
 #include "tiles.h"
 
-#include <utility>
-
-#include "parallel.h"
+#include <cmath>
 
 namespace cap4d {
 namespace {
-
-// Ranks are binned in chunks; a tile's list is the chunks' lists one after the other, so their number never shows.
-constexpr std::size_t kChunks = 16;
 
 struct Span {  // inclusive
   int first, last;
@@ -27,51 +22,25 @@ Span outline_span(const Splat& s, int row0, int row1, int columns) {
 
 }  // namespace
 
-void list_tiles(const Splat& splat, TileBox box, const Camera& camera, std::vector<std::uint32_t>& tiles) {
+TileSet tiles_of(const Splat& splat, TileBox box, const Camera& camera, std::vector<std::uint32_t>& list, std::uint32_t& count) {
   const std::uint32_t columns = grid_of(camera).columns;
   const bool thin = box.x0 == box.x1 || box.y0 == box.y1;  // an ellipse meets every tile of a box one tile wide
+  const bool small = box.x1 - box.x0 < TileSet::kSide && box.y1 - box.y0 < TileSet::kSide;
+  const std::size_t before = list.size();
+  std::uint32_t mask = 0;
   for (int row = box.y0; row <= box.y1; ++row) {
     int first = box.x0, last = box.x1;
     if (!thin) {
       const Span span = outline_span(splat, row * kTile, std::min((row + 1) * kTile, camera.height) - 1, camera.width);
       if (span.last < span.first) continue;
-      first = span.first / kTile, last = span.last / kTile;
+      first = std::max(first, span.first / kTile), last = std::min(last, span.last / kTile);
     }
-    for (int column = first; column <= last; ++column) tiles.push_back(row * columns + column);
+    if (small && first <= last) mask |= ((1u << (last - box.x0 + 1)) - (1u << (first - box.x0))) << (row - box.y0) * TileSet::kSide;
+    if (!small)
+      for (int column = first; column <= last; ++column) list.push_back(row * columns + column);
   }
-}
-
-TileLists make_tile_lists(const Pairs& pairs, const std::uint32_t* order, std::size_t drawn, Grid grid, bool with_slots, int threads) {
-  const std::size_t tiles = grid.count(), size = (drawn + kChunks - 1) / kChunks;
-  TileLists lists;
-  lists.isects = make_buffer<std::uint32_t>(pairs.count);
-  if (with_slots) lists.slots = make_buffer<std::uint32_t>(pairs.count);
-  lists.offsets.resize(tiles + 1);
-  std::vector<std::uint32_t> places(kChunks * tiles, 0);  // first counts, then where the chunk's next Gaussian of the tile goes
-  const auto each_pair = [&](std::size_t chunk, auto&& visit) {
-    std::uint32_t* place = places.data() + chunk * tiles;
-    for (std::size_t rank = std::min(drawn, chunk * size); rank < std::min(drawn, (chunk + 1) * size); ++rank) {
-      const std::uint32_t id = order[rank];
-      for (std::uint32_t pair = pairs.offsets[id]; pair < pairs.offsets[id + 1]; ++pair) visit(id, pair, place[pairs.tiles[pair]]++);
-    }
-  };
-  parallel_for(kChunks, 1, threads, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t chunk = begin; chunk < end; ++chunk) each_pair(chunk, [](std::uint32_t, std::uint32_t, std::uint32_t) {});
-  });
-  std::uint32_t next = 0;
-  for (std::size_t tile = 0; tile < tiles; ++tile) {
-    lists.offsets[tile] = next;
-    for (std::size_t chunk = 0; chunk < kChunks; ++chunk) next += std::exchange(places[chunk * tiles + tile], next);
-  }
-  lists.offsets[tiles] = next;
-  parallel_for(kChunks, 1, threads, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t chunk = begin; chunk < end; ++chunk)
-      each_pair(chunk, [&](std::uint32_t id, std::uint32_t pair, std::uint32_t place) {
-        lists.isects[place] = id;
-        if (with_slots) lists.slots[place] = pair;
-      });
-  });
-  return lists;
+  count = small ? std::popcount(mask) : static_cast<std::uint32_t>(list.size() - before);
+  return small ? TileSet::small(box.x0, box.y0, mask) : TileSet::listed();
 }
 
 }  // namespace cap4d

@@ -1,25 +1,17 @@
 // Which Gaussians meet which tiles: the exact ellipse where alpha >= 1/255 against rows of tiles; and each tile's list, near to far.
 #pragma once
 #include <algorithm>
-#include <cmath>
+#include <bit>
 #include <cstddef>
 #include <cstdint>
-#include <memory>
 #include <vector>
 
 #include "camera.h"
 #include "constants.h"
 #include "gaussians.h"
+#include "scratch.h"
 
 namespace cap4d {
-
-template <class T>
-using Buffer = std::unique_ptr<T[]>;
-
-template <class T>
-Buffer<T> make_buffer(std::size_t n) {  // not initialised
-  return std::make_unique_for_overwrite<T[]>(n ? n : 1);
-}
 
 struct Grid {  // of tiles
   int columns, rows;
@@ -28,24 +20,61 @@ struct Grid {  // of tiles
 
 inline Grid grid_of(const Camera& camera) { return {(camera.width + kTile - 1) / kTile, (camera.height + kTile - 1) / kTile}; }
 
-// A pair is a Gaussian and a tile it meets. Pairs are numbered Gaussian after Gaussian, in the caller's order.
-struct Pairs {
-  Buffer<std::uint32_t> tiles;    // [count]
-  Buffer<std::uint32_t> offsets;  // [N + 1] first pair of each Gaussian
-  std::uint32_t count = 0;
+// The tiles that one Gaussian meets, in one word where they lie within 3 x 3: the first tile's column and row, and a bit for each of
+// the nine. Nearly all do; the others' tiles stand in a list.
+class TileSet {
+ public:
+  static constexpr int kSide = 3;
+
+  static TileSet small(int column, int row, std::uint32_t mask) { return TileSet(static_cast<std::uint32_t>(column | row << 10) | mask << 20); }
+  static TileSet listed() { return TileSet(1u << 31); }
+  bool is_listed() const { return word_ >> 31; }
+  // Calls visit(tile) in scan order.
+  template <class Visit>
+  void each(int columns, const Visit& visit) const {
+    const std::uint32_t first = (word_ >> 10 & 1023) * columns + (word_ & 1023);
+    for (std::uint32_t mask = word_ >> 20; mask; mask &= mask - 1) {
+      const int bit = std::countr_zero(mask);
+      visit(first + bit / kSide * columns + bit % kSide);
+    }
+  }
+  TileSet() = default;
+
+ private:
+  explicit TileSet(std::uint32_t word) : word_(word) {}
+  std::uint32_t word_;
+};
+static_assert(kMaxSide / kTile <= 1024);
+
+// A drawn Gaussian on its way to the tiles' lists; sorted by depth.
+struct Drawn {
+  std::uint32_t key;  // the depth's bits: positive floats sort as unsigned integers
+  std::uint32_t id;
+  TileSet tiles;
 };
 
-// The tiles of one drawn splat appended to `tiles`.
-void list_tiles(const Splat& splat, TileBox box, const Camera& camera, std::vector<std::uint32_t>& tiles);
+// The tiles of one drawn splat; those of a large one are appended to `list`. `count` is their number.
+TileSet tiles_of(const Splat& splat, TileBox box, const Camera& camera, std::vector<std::uint32_t>& list, std::uint32_t& count);
 
 // Each tile's Gaussians, near to far.
 struct TileLists {
-  std::vector<std::uint32_t> offsets;  // [tiles + 1]
-  Buffer<std::uint32_t> isects;        // [pairs] Gaussian
-  Buffer<std::uint32_t> slots;         // [pairs] pair; only for the gradient
+  Scratch<std::uint32_t> offsets;  // [tiles + 1]
+  Scratch<std::uint32_t> isects;   // [pairs] Gaussian
+  Scratch<std::uint32_t> slots;    // [pairs] pair; only for the gradient
+  Scratch<std::uint32_t> places;   // of the chunks
 };
 
-// order [drawn]: the Gaussians near to far.
-TileLists make_tile_lists(const Pairs& pairs, const std::uint32_t* order, std::size_t drawn, Grid grid, bool with_slots, int threads);
+// What a Gaussian's TileSet does not say: its first pair's number, and its tiles where they are listed.
+struct PairsOf {
+  std::uint32_t first, count;
+  const std::uint32_t* tiles;
+};
+
+// drawn [count]: the Gaussians near to far; `pairs_of(id)` gives PairsOf, and is asked only where it must be. `slots` may be left out.
+template <class Lookup>
+void make_tile_lists(const Drawn* drawn, std::size_t count, std::size_t pairs, Grid grid, bool with_slots, int threads, const Lookup& pairs_of,
+                     TileLists& lists);
 
 }  // namespace cap4d
+
+#include "tiles_impl.h"

@@ -168,7 +168,7 @@ def test_an_unknown_instruction_set_is_refused() -> None:
     command = [sys.executable, "-c", "from cap4d import _core; _core.isa()"]
     run = subprocess.run(command, env=os.environ | {"CAP4D_ISA": "v5"}, capture_output=True, text=True)
     assert run.returncode == 1
-    assert run.stderr.splitlines()[-1] == "ValueError: CAP4D_ISA: expected base|v3|v4, got v5"
+    assert run.stderr.splitlines()[-1] == "ValueError: CAP4D_ISA: expected base|v3|v4|vnni, got v5"
 
 
 CROWD = """

@@ -6,21 +6,25 @@ import json
 import struct
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load
 
 pytest.importorskip("onnx")
 
 import onnx
 from bundle_forge import Forge
+from quantized_reference import random_network
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import Bundle, read_bundle, write_bundle
 from cap4d.bundle.container import CENTRAL_MAGIC, LOCAL_MAGIC
 from cap4d.bundle.onnx_scan import scan_onnx
-from cap4d.bundle.schema import GAUSSIANS, GRID, IDLE, MANIFEST, ONNX, PREVIEW, RIG
+from cap4d.bundle.schema import GAUSSIANS, GRID, IDLE, INT8, MANIFEST, ONNX, PREVIEW, RIG
+from cap4d.bundle.writer import PACKED
 from cap4d.errors import DataError
 
 SIZE = 8
@@ -216,7 +220,7 @@ MANIFESTS = {
     "endless_number": (raw(lambda t: t.replace('"version": 1', '"version": ' + "1" * 5000)), "JSON"),
     "too_large": (raw(lambda t: t + " " * (1 << 20)), "size"),
     "another_format": (put("gltf", "format"), "format"),
-    "newer": (put(2, "version"), "version"),
+    "newer": (put(3, "version"), "version"),
     "version_zero": (put(0, "version"), "version"),
     "version_text": (put("1", "version"), "version"),
     "version_flag": (put(True, "version"), "version"),
@@ -267,6 +271,9 @@ MANIFESTS = {
     "hash_form": (put("zz", "entries", RIG, "sha256"), f"entries.{RIG}.sha256"),
     "entry_not_in_zip": (lambda f: f.entries.pop(ONNX), "entry"),
     "entry_not_listed": (drop("entries", ONNX), "entry"),
+    "mixed_in_version_1": (put("mixed", "precision"), "version"),
+    "tiers_in_version_1": (put({"off": {"rms_mm": 1, "max_mm": 2}}, "deformer"), "version"),
+    "int8_in_version_1": (put({"size": 1, "sha256": "0" * 64}, "entries", INT8), "version"),
 }
 
 
@@ -389,6 +396,127 @@ def test_broken_safetensors(data: bytes, sound: Path, tmp_path: Path) -> None:
     forge.sign()
     forge.write(path)
     assert refusal(path).source == f"{path}:{IDLE}"
+
+
+# Version 2 ------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compact(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound file of version 2: all packed tensors int8, the expression basis masked."""
+    bundle = tiny_bundle(SIZE, gaussians=1, mesh=False)
+    basis = bundle.subject.expression_basis.copy()
+    basis[:, 9:] = 0
+    linear = np.zeros_like(basis)
+    linear[:, bundle.grid.deformable] = 1e-3
+    bundle = replace(
+        bundle,
+        subject=replace(bundle.subject, expression_basis=basis),
+        deform_int8=random_network(SIZE, 1),
+        deform_linear=linear,
+        tier_errors={"int8": (0.1, 0.2)},
+    )
+    path = tmp_path_factory.mktemp("compact") / "compact.cap4d"
+    write_bundle(bundle, path, precision=dict.fromkeys(PACKED, "int8"))
+    return path
+
+
+def test_the_compact_file_is_what_its_abuse_needs(compact: Path) -> None:
+    tensors = load(Forge(compact).entries[RIG])
+    assert tensors["expression_basis"].shape == (5 * 9, 3) and "expression_basis.mask" in tensors
+    assert tensors["expression_basis"].dtype == np.int8 == load(Forge(compact).entries[GAUSSIANS])["sh"].dtype
+    assert read_bundle(compact).tier_errors == {"int8": (0.1, 0.2)}
+
+
+COMPACT_MANIFESTS = {
+    "version_1": (put(1, "version"), "version"),
+    "another_precision": (put("float32", "precision"), "deform_linear.steps"),
+    "tier": (put({"int4": {"rms_mm": 0, "max_mm": 0}}, "deformer"), "deformer.int4"),
+    "tier_list": (put([], "deformer"), "deformer"),
+    "tier_number": (put(1, "deformer", "int8"), "deformer.int8"),
+    "tier_field": (put(1, "deformer", "int8", "p99_mm"), "deformer.int8.p99_mm"),
+    "tier_field_missing": (drop("deformer", "int8", "max_mm"), "deformer.int8.max_mm"),
+    "tier_error_negative": (put(-1, "deformer", "int8", "rms_mm"), "deformer.int8.rms_mm"),
+    "tier_error_text": (put("0", "deformer", "int8", "rms_mm"), "deformer.int8.rms_mm"),
+    "tier_error_huge": (put(1e5, "deformer", "int8", "max_mm"), "deformer.int8.max_mm"),
+    "tier_error_infinite": (raw(lambda t: t.replace('"rms_mm": 0.1', '"rms_mm": 1e999')),
+                            "deformer.int8.rms_mm"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", COMPACT_MANIFESTS)
+def test_manifest_of_version_2(name: str, compact: Path, tmp_path: Path) -> None:
+    change, field = COMPACT_MANIFESTS[name]
+    forge, path = Forge(compact), tmp_path / "bad.cap4d"
+    change(forge)
+    forge.write(path)
+    assert refusal(path).field == field
+
+
+def added(entry: str, name: str, value: np.ndarray) -> tuple[str, Callable[[dict], None]]:
+    return entry, lambda tensors: tensors.update({name: value})
+
+
+BASIS, STEPS, MASK = "expression_basis", "expression_basis.steps", "expression_basis.mask"
+COMPACT_ABUSE = {
+    "int8_without_steps": ((GAUSSIANS, lambda t: t.pop("sh.steps")), "sh"),
+    "steps_of_a_float": (remade(GAUSSIANS, "sh", np.float32), "sh"),
+    "steps_without_a_tensor": ((GAUSSIANS, lambda t: t.pop("sh")), "tensors"),
+    "steps_of_an_index": (added(GAUSSIANS, "binding.steps", np.zeros(2, np.float32)), "tensors"),
+    "steps_of_a_plain_float": (added(RIG, "neutral.steps", np.zeros((3, 2), np.float32)), "tensors"),
+    "steps_of_steps": (added(GAUSSIANS, "sh.steps.steps", np.zeros(2, np.float32)), "tensors"),
+    "steps_too_few": (remade(GAUSSIANS, "sh.steps", lambda v: v[:1]), "sh.steps"),
+    "steps_transposed": (remade(GAUSSIANS, "quats.steps", lambda v: v.T), "quats.steps"),
+    "steps_of_columns_for_rows": (remade(RIG, STEPS, lambda v: v[:3]), STEPS),
+    "steps_float16": (remade(GAUSSIANS, "sh.steps", np.float16), "sh.steps"),
+    "steps_nan": (at(GAUSSIANS, "means.steps", (0, 0), np.nan), "means.steps"),
+    "steps_infinite": (at(GAUSSIANS, "means.steps", (0, 1), np.inf), "means.steps"),
+    "steps_negative": (at(RIG, STEPS, (0, 0), -1e-3), STEPS),
+    "steps_overflow": (at(GAUSSIANS, "means.steps", (0, 0), 3e38), "means"),
+    "out_of_range_once_unpacked": (at(GAUSSIANS, "log_scales.steps", (0, 1), 100), "log_scales"),
+    "millimetres": (at(RIG, STEPS, (0, 0), 1), BASIS),
+    "no_rotation_once_unpacked": (remade(GAUSSIANS, "quats.steps", np.zeros_like), "quats"),
+    "int8_shape": (remade(GAUSSIANS, "means", lambda v: v[1:]), "means"),
+    "uint8": (remade(GAUSSIANS, "means", lambda v: v.view(np.uint8)), "means"),
+    "mask_gone": ((RIG, lambda t: t.pop(MASK)), BASIS),
+    "mask_of_gaussians": (added(GAUSSIANS, "sh.mask", np.zeros((1, 1), np.uint8)), "tensors"),
+    "mask_of_another_row_count": (remade(RIG, MASK, lambda v: v[1:]), MASK),
+    "mask_of_another_length": (remade(RIG, MASK, lambda v: v[:, 1:]), MASK),
+    "mask_of_bytes": (remade(RIG, MASK, lambda v: v.astype(np.uint16)), MASK),
+    "mask_without_a_tensor": ((RIG, lambda t: (t.pop(BASIS), t.pop(STEPS))), "tensors"),
+    "mask_of_more_points": (at(RIG, MASK, (0, 3), 0x10), BASIS),
+    "mask_of_fewer_points": (at(RIG, MASK, (0, 0), 0), BASIS),
+    "mask_beyond_the_points": (at(RIG, MASK, (0, -1), 0x80), MASK),
+    "masked_points_of_two": (remade(RIG, BASIS, lambda v: v[:, :2]), BASIS),
+    "linear_where_nothing_deforms": (
+        remade(GRID, "deformable", lambda v: v * (np.arange(len(v)) < 50)), "deform_linear"),
+    "int8_network_of_floats": (remade(INT8, "down1.weight", np.float32), "down1.weight"),
+    "int8_network_without_tensors": ((INT8, lambda t: t.clear()), "down0.weight"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", COMPACT_ABUSE)
+def test_tensors_of_version_2(name: str, compact: Path, tmp_path: Path) -> None:
+    (entry, change), field = COMPACT_ABUSE[name]
+    forge, path = Forge(compact), tmp_path / "bad.cap4d"
+    forge.tensors(entry, change)
+    forge.sign()
+    forge.write(path)
+    error = refusal(path)
+    assert error.field == field and error.source == f"{path}:{entry}"
+
+
+def test_companions_in_version_1_are_refused(sound: Path, tmp_path: Path) -> None:
+    forge, path = Forge(sound), tmp_path / "bad.cap4d"
+    forge.tensors(*added(GRID, "deform_linear", np.zeros((5, 52, 3), np.float32)))
+    forge.sign()
+    forge.write(path)
+    assert refusal(path).field == "tensors"
+    forge = Forge(sound)
+    forge.tensors(*added(RIG, MASK, np.zeros((5, 7), np.uint8)))
+    forge.sign()
+    forge.write(path)
+    assert refusal(path).field == "tensors"
 
 
 # Pictures and networks ------------------------------------------------------------
@@ -619,10 +747,14 @@ def test_damaged_files_load_as_they_were_or_are_refused(sound: Path, tmp_path: P
     assert refused > 300
 
 
-@pytest.mark.parametrize("entry", [MANIFEST, GRID, RIG, GAUSSIANS, IDLE, ONNX, PREVIEW])
+@pytest.mark.parametrize("file", ["sound", "compact"])
+@pytest.mark.parametrize("entry", [MANIFEST, GRID, RIG, GAUSSIANS, IDLE, ONNX, INT8, PREVIEW])
 def test_damaged_entries_with_fitting_hashes_raise_nothing_but_data_errors(
-    entry: str, sound: Path, tmp_path: Path
+    entry: str, file: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
+    sound: Path = request.getfixturevalue(file)
+    if entry not in ({MANIFEST} | Forge(sound).entries.keys()):
+        pytest.skip("version 1 has no such entry")
     rng, path = np.random.default_rng(11), tmp_path / "fuzz.cap4d"
     refused = 0
     for _ in range(60):

@@ -12,12 +12,14 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from quantized_reference import random_network
 from tiny_bundle import tiny_bundle, tiny_mesh
 
 from cap4d.bundle import Bundle, describe, read_bundle, read_manifest, schema, write_bundle
 from cap4d.bundle.onnx_scan import scan_onnx
-from cap4d.bundle.schema import GAUSSIANS, GRID, IDLE, RIG, TENSORS, stored_dtype, stored_shape
-from cap4d.bundle.writer import SUBJECT_ARRAYS, bundle_counts
+from cap4d.bundle.packing import rounded
+from cap4d.bundle.schema import GAUSSIANS, GRID, IDLE, ONNX, RIG, TENSORS, stored_dtype, stored_shape
+from cap4d.bundle.writer import PACKED, SUBJECT_ARRAYS, bundle_counts
 from cap4d.camera import Camera
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError, DataError
@@ -30,6 +32,16 @@ GAUSSIAN_ARRAYS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 @pytest.fixture(scope="module")
 def bundle() -> Bundle:
     return tiny_bundle()
+
+
+def bundle_of_tiers(*, network: bool = True) -> Bundle:
+    """A bundle with all that version 2 brought."""
+    bundle = tiny_bundle(network=network, mesh=False)
+    linear = 1e-3 * np.random.default_rng(2).normal(size=bundle.subject.expression_basis.shape)
+    linear[:, ~bundle.grid.deformable] = 0
+    quantized = random_network(bundle.grid.size, 1)
+    errors = {"int8": (0.01, 0.2), "linear": (0.1, 1.5)}
+    return replace(bundle, deform_int8=quantized, deform_linear=linear.astype(np.float32), tier_errors=errors)
 
 
 def bundle_on_mesh() -> Bundle:
@@ -49,6 +61,8 @@ def assert_same(a: object, b: object) -> None:
             assert_same(left, right)
         elif isinstance(left, np.ndarray):
             assert left.dtype == right.dtype and np.array_equal(left, right), field.name
+        elif isinstance(left, dict) and any(isinstance(v, np.ndarray) for v in left.values()):
+            assert left.keys() == right.keys() and all(np.array_equal(left[k], right[k]) for k in left)
         else:
             assert left == right, field.name
 
@@ -90,6 +104,99 @@ def test_the_idle_clip_keeps_its_head_pose(bundle: Bundle, tmp_path: Path) -> No
     moving = replace(bundle, idle=replace(bundle.idle, rot=pose[0], tra=pose[1]), mesh_subject=None)
     write_bundle(moving, tmp_path / "a.cap4d")
     assert_same(moving, read_bundle(tmp_path / "a.cap4d"))
+
+
+# Version 2 ------------------------------------------------------------
+
+
+def test_a_bundle_without_new_things_is_of_version_1(bundle: Bundle, tmp_path: Path) -> None:
+    """Readers of version 1 go on reading what new writers write."""
+    for precision in ("float32", "float16"):
+        write_bundle(bundle, tmp_path / "a.cap4d", precision=precision)
+        assert read_manifest(tmp_path / "a.cap4d").version == 1
+
+
+def test_files_of_version_1_still_load() -> None:
+    """Written by the first release's writer, kept since."""
+    old = read_bundle(Path(__file__).parents[1] / "data" / "version_1.cap4d")
+    assert_same(replace(tiny_bundle(8, gaussians=1, network=False), mesh_subject=None), old)
+
+
+@pytest.mark.parametrize("network", [True, False])
+def test_all_tiers_come_back_bit_for_bit(network: bool, tmp_path: Path) -> None:
+    bundle = bundle_of_tiers(network=network)
+    write_bundle(bundle, tmp_path / "a.cap4d")
+    assert read_manifest(tmp_path / "a.cap4d").version == 2
+    assert_same(bundle, read_bundle(tmp_path / "a.cap4d"))
+
+
+@pytest.mark.parametrize("kept", ["deform_onnx", "deform_int8", "deform_linear"])
+def test_one_deformer_is_enough(kept: str, tmp_path: Path) -> None:
+    parts = ("deform_onnx", "deform_int8", "deform_linear")
+    lone = replace(bundle_of_tiers(), **{part: None for part in parts if part != kept})
+    write_bundle(lone, tmp_path / "a.cap4d")
+    assert_same(lone, read_bundle(tmp_path / "a.cap4d"))
+
+
+FORMS = {name: "int8" for name in PACKED} | {"means": "float16", "quats": "float32", ONNX: "float16"}
+
+
+def test_each_tensor_has_its_own_form(tmp_path: Path) -> None:
+    bundle = bundle_of_tiers()
+    write_bundle(bundle, tmp_path / "a.cap4d", precision=FORMS)
+    back = read_bundle(tmp_path / "a.cap4d")
+    assert read_manifest(tmp_path / "a.cap4d").precision == "mixed"
+    for entry, owner, found in ((GAUSSIANS, bundle, back), (RIG, bundle.subject, back.subject)):
+        for name, spec in TENSORS[entry].items():
+            values = getattr(owner, name)
+            expected = rounded(values, spec, FORMS[name]) if name in FORMS else values
+            assert np.array_equal(getattr(found, name), expected), name
+    assert np.array_equal(back.quats, bundle.quats)
+    # int8 is off by at most half a step; a basis has a step a row, and its zeros stay zeros.
+    linear, rounded_linear = bundle.deform_linear, back.deform_linear
+    half_steps = np.abs(linear).max((1, 2), keepdims=True) / 127 / 2
+    assert (np.abs(linear - rounded_linear) <= 1.001 * half_steps).all()
+    assert (rounded_linear[:, ~bundle.grid.deformable] == 0).all()
+    spans = bundle.sh.max(0) - bundle.sh.min(0)
+    assert (np.abs(bundle.sh - back.sh) <= 1.001 * spans / 254 / 2).all()
+
+
+def test_writing_twice_what_was_rounded_changes_little_and_once_nothing(tmp_path: Path) -> None:
+    write_bundle(bundle_of_tiers(), tmp_path / "a.cap4d", precision=FORMS)
+    write_bundle(bundle_of_tiers(), tmp_path / "b.cap4d", precision=FORMS)
+    assert (tmp_path / "a.cap4d").read_bytes() == (tmp_path / "b.cap4d").read_bytes()
+    once = read_bundle(tmp_path / "a.cap4d")
+    write_bundle(once, tmp_path / "c.cap4d", precision=FORMS)
+    twice = read_bundle(tmp_path / "c.cap4d")
+    assert np.allclose(once.sh, twice.sh, rtol=0, atol=1e-6)
+    assert np.allclose(once.deform_linear, twice.deform_linear, rtol=1e-6, atol=0)
+
+
+def test_a_basis_that_moves_little_is_masked(tmp_path: Path) -> None:
+    bundle = bundle_of_tiers(network=False)
+    write_bundle(bundle, tmp_path / "dense.cap4d", precision=FORMS)
+    basis = bundle.subject.expression_basis.copy()
+    basis[:, basis.shape[1] // 8 :] = 0
+    sparse = replace(bundle, subject=replace(bundle.subject, expression_basis=basis))
+    write_bundle(sparse, tmp_path / "a.cap4d", precision=FORMS)
+    found = read_bundle(tmp_path / "a.cap4d").subject.expression_basis
+    spec = TENSORS[RIG]["expression_basis"]
+    assert np.array_equal(found, rounded(basis, spec, "int8"))
+    saved = (tmp_path / "dense.cap4d").stat().st_size - (tmp_path / "a.cap4d").stat().st_size
+    assert saved > 0.8 * basis.size * 7 / 8
+
+
+@pytest.mark.parametrize("precision", [{"means": "int4"}, {"binding": "int8"}, {ONNX: "int8"}])
+def test_forms_that_are_not_are_refused(precision: dict, bundle: Bundle, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="precision"):
+        write_bundle(bundle, tmp_path / "a.cap4d", precision=precision)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_linear_deformer_moves_only_what_is_deformable(tmp_path: Path) -> None:
+    bundle = bundle_of_tiers()
+    with pytest.raises(DataError, match="deform_linear: expected 0 where"):
+        write_bundle(replace(bundle, deform_linear=bundle.deform_linear + 1e-3), tmp_path / "a.cap4d")
 
 
 @pytest.mark.parametrize("precision", ["float32", "float16"])
@@ -175,11 +282,12 @@ RELEASED = {
 
 
 def tensor_bytes(counts: dict[str, int], precision: str) -> int:
-    """All tensors of a file with these counts, every optional one included."""
+    """All tensors of a version 1 file with these counts, every optional one included."""
     return sum(
         int(np.prod(stored_shape(spec, counts))) * stored_dtype(spec, counts, precision).itemsize
         for entry in (GRID, RIG, GAUSSIANS, IDLE)
         for spec in TENSORS[entry].values()
+        if spec.since == 1
     )
 
 
@@ -272,8 +380,24 @@ def test_a_folder_that_is_not_there_is_an_argument_error(bundle: Bundle, tmp_pat
 def test_describe_says_what_is_inside(bundle: Bundle, tmp_path: Path) -> None:
     write_bundle(bundle, tmp_path / "a.cap4d")
     text = describe(tmp_path / "a.cap4d")
-    for word in ("tiny", "CC0-1.0", "jawOpen", f"gaussians: {len(bundle)}", "16x16", "deform.onnx"):
+    for word in (
+        "version 1",
+        "deformers: full",
+        "tiny",
+        "CC0-1.0",
+        "jawOpen",
+        f"gaussians: {len(bundle)}",
+        "16x16",
+        "deform.onnx",
+    ):
         assert word in text
+
+
+def test_describe_says_which_deformers_there_are(tmp_path: Path) -> None:
+    write_bundle(bundle_of_tiers(network=False), tmp_path / "a.cap4d", precision=FORMS)
+    text = describe(tmp_path / "a.cap4d")
+    assert "version 2, mixed" in text and "full" not in text
+    assert "int8 (0.010 mm RMS, 0.20 mm at most), linear (0.100 mm RMS, 1.50 mm at most)" in text
 
 
 def test_the_scanner_counts_what_it_sees(bundle: Bundle) -> None:

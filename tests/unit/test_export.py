@@ -4,21 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 from tiny_avatar import tiny_avatar, tiny_camera, tiny_rig
 
-from cap4d.avatar.deformer import DEFORM_STD, Deformer
+from cap4d.avatar.deformer import DEFORM_STD, Deformer, downsamplings
 from cap4d.avatar.model import Pose
 from cap4d.bundle import read_bundle
+from cap4d.bundle.onnx_half import halve_weights
 from cap4d.bundle.onnx_scan import scan_onnx
 from cap4d.capture.capture import Capture
 from cap4d.drive.clip import Clip
-from cap4d.errors import Cap4dError
+from cap4d.errors import ArgumentError, Cap4dError
 from cap4d.export import bundle as bundle_module
 from cap4d.export.bundle import export_bundle
 from cap4d.export.deformer import export_deformer, worst_difference
 from cap4d.export.idle import SHUT, blinking, idle_clip, is_film, looped
+from cap4d.export.unet_onnx import network_weights, rewritten, unet_onnx
 
 
 def trained_looking(deformer, seed=0):
@@ -49,6 +52,36 @@ def test_onnx_is_self_contained_and_small():
     summary = scan_onnx(data, source="deform.onnx", size=32)
     assert summary.opset == 17
     assert not any(t.external_data for t in onnx.load_from_string(data).graph.initializer)
+
+
+def test_weights_keep_the_names_and_layout_of_the_released_state_dicts():
+    net = trained_looking(Deformer(np.ones((32, 32), bool), width=4))
+    weights = network_weights(export_deformer(net))
+    for name, value in net.state_dict().items():
+        np.testing.assert_array_equal(weights[name], value.numpy())
+
+
+def test_the_positional_encoding_costs_nothing_per_frame(tmp_path):
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    options.log_severity_level = 4
+    net = trained_looking(Deformer(np.ones((64, 64), bool), width=4))
+    onnxruntime.InferenceSession(export_deformer(net), options, providers=["CPUExecutionProvider"])
+    nodes = [n.op_type for n in onnx.load(tmp_path / "optimised.onnx").graph.node]
+    assert nodes.count("Conv") == nodes.count("ConvTranspose") == downsamplings(64)
+    assert not {"Expand", "Slice"} & set(nodes)
+
+
+def test_a_network_from_before_is_rewritten_to_the_same_answers():
+    net = trained_looking(Deformer(np.ones((32, 32), bool), width=4))
+    offsets = torch.randn(2, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * DEFORM_STD
+    data = export_deformer(net)
+    assert rewritten(data) == data
+    half = rewritten(halve_weights(data))
+    assert 1e-6 < worst_difference(half, net, offsets) < 1e-2
+    scan_onnx(half, source="deform.onnx", size=32)
+    with pytest.raises(ArgumentError, match=r"expected the weights of a U-Net, 'model\.model\.3\.weight' is"):
+        unet_onnx({k: v for k, v in network_weights(data).items() if k != "model.model.3.weight"})
 
 
 def capture_and_clip(tmp_path, frames=40):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ pytest.importorskip("onnx")
 
 from tiny_bundle import tiny_grid, tiny_network
 
-from cap4d.errors import DataError
+from cap4d.errors import ArgumentError, DataError
 from cap4d.player.deformer import Deformer, default_threads
 
 SIZE = 8
@@ -37,6 +39,35 @@ def test_the_cache_survives_a_reused_buffer(model: bytes) -> None:
     first = deformer(buffer).copy()
     buffer[:] = offsets(1)
     assert not np.array_equal(deformer(buffer), first)
+
+
+def test_an_answer_outlives_the_next_pass(model: bytes) -> None:
+    deformer = Deformer(model, size=SIZE)
+    first = deformer(offsets(0))
+    kept = first.copy()
+    second = deformer(offsets(1))
+    assert np.array_equal(first, kept) and not np.shares_memory(first, second)
+
+
+def test_a_pass_allocates_no_map() -> None:
+    size = 64
+    deformer = Deformer(tiny_network(tiny_grid(size)), size=size)
+    frames = [np.full((3, size, size), 1e-3 * k, np.float32) for k in range(4)]
+    for frame in frames:
+        deformer(frame)
+    tracemalloc.start()
+    try:
+        for frame in frames:
+            deformer(frame)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert deformer.passes == 8 and peak < size * size
+
+
+def test_offsets_of_another_shape_are_refused(model: bytes) -> None:
+    with pytest.raises(ArgumentError, match=r"offsets: expected float32\[3, 8, 8\], got \[3, 16, 16\]"):
+        Deformer(model, size=SIZE)(np.zeros((3, 16, 16), np.float32))
 
 
 def test_the_answer_does_not_depend_on_the_number_of_threads(model: bytes) -> None:

@@ -106,6 +106,18 @@ def test_what_does_not_fit_is_refused() -> None:
         rasterize(means, quats, scales, opacities, sh, camera=view(), backend="opengl")  # type: ignore[arg-type]
 
 
+def test_the_tiles_of_the_reference_leave_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one tile, and with every Gaussian in every tile, the pictures are the same to rounding."""
+    inputs, camera = tensors(spread=0.1, size=0.02), view(70, 50)
+    options = {"camera": camera, "background": None, "sh_degree": 3}
+    tiled = rasterize_reference(*inputs, **options)
+    monkeypatch.setattr("cap4d.raster.reference.TILE", 128)
+    whole = rasterize_reference(*inputs, **options)
+    assert tiled.alpha.max() > 0.5
+    for name in ("rgb", "alpha", "depth"):
+        torch.testing.assert_close(getattr(tiled, name), getattr(whole, name), rtol=1e-12, atol=1e-14)
+
+
 def test_gsplat_is_asked_for_by_name() -> None:
     wanted = "CUDA" if importlib.util.find_spec("gsplat") else "not installed"
     with pytest.raises(ArgumentError, match=wanted):

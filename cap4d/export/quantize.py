@@ -1,0 +1,191 @@
+"""The deformation network in 8-bit integers, its ranges taken from the avatar's own expressions.
+
+Weights get a scale per output channel and activations one per channel, each the one with the least squared
+error; an activation's scale is folded into the weights that read it. The first layer stays in float32, its
+constant inputs summed up once. What is stored is described in `bundle.quantized_unet`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+import torch
+from onnx import numpy_helper
+from torch.nn import functional
+
+from cap4d.bundle.quantized_unet import SMALLEST_SCALE, check_quantized, depth
+
+LEAK = 0.2
+NORM_EPS = 1e-5
+SAMPLES = 16384  # values per channel that ranges are chosen from
+RANGES = np.linspace(0.3, 1, 29, dtype=np.float32)  # shares of the full range that are tried
+WEIGHT_MAX = 127
+
+
+def quantize(onnx_model: bytes, offsets: np.ndarray) -> dict[str, np.ndarray]:
+    """A network for `_core.QuantizedUnet`.
+
+    Args:
+        onnx_model: What `export_deformer` wrote.
+        offsets: float32[B, 3, S, S] m, what the network will be asked; some tens of expressions.
+    Returns:
+        The tensors of `bundle.quantized_unet`.
+    """
+    net = _FloatNet.load(onnx_model)
+    samples = net.sample(torch.from_numpy(np.ascontiguousarray(offsets, np.float32)))
+    tensors = {"mask": net.mask.astype(np.uint8), **net.first_layer()}
+    inputs: dict[str, np.ndarray] = {}
+    for i in range(net.depth):
+        x = samples[f"down{i}"]
+        if i > 0:
+            weight = net.down[i][0] * inputs[f"leaky{i - 1}"][:, None, None]
+            tensors[f"down{i}.weight"], tensors[f"down{i}.scale"] = _quantize_weight(weight)
+        if i == net.depth - 1:
+            tensors[f"down{i}.bias"] = net.down[i][1]
+        else:
+            scale, zero = _leaky_range(x)
+            tensors[f"down{i}.leaky_scale"], tensors[f"down{i}.leaky_zero"] = scale, zero
+            inputs[f"leaky{i}"] = scale
+        tensors[f"down{i}.relu_scale"] = inputs[f"relu{i}"] = _relu_range(x)
+    below: list[np.ndarray] = []  # the scales of what up i + 1 puts out
+    for i in reversed(range(net.depth)):
+        scales = np.concatenate([inputs[f"relu{i}"], *below])
+        weight = np.moveaxis(net.up[i][0] * scales[:, None, None, None], 1, 0)
+        quantized, scale = _quantize_weight(weight)
+        tensors[f"up{i}.weight"] = np.ascontiguousarray(np.moveaxis(quantized, 0, 1))
+        tensors[f"up{i}.scale"] = scale * (net.metres if i == 0 else np.float32(1))
+        if i > 0:
+            tensors[f"up{i}.relu_scale"] = _relu_range(samples[f"up{i}"])
+            below = [tensors[f"up{i}.relu_scale"]]
+    tensors["up0.bias"] = net.up[0][1] * net.metres
+    check_quantized(tensors, source="quantize", size=net.size)
+    return tensors
+
+
+@dataclass(frozen=True)
+class _FloatNet:
+    """The exported network's numbers: per layer weight and bias, as torch has them."""
+
+    size: int
+    mask: np.ndarray
+    per_metre: np.float32
+    metres: np.float32
+    encoding: torch.Tensor
+    down: list[tuple[np.ndarray, np.ndarray]]
+    up: list[tuple[np.ndarray, np.ndarray]]
+
+    @classmethod
+    def load(cls, onnx_model: bytes) -> _FloatNet:
+        graph = onnx.load_model_from_string(onnx_model).graph
+        values = {i.name: numpy_helper.to_array(i).astype(np.float32) for i in graph.initializer}
+        scale = values["scale"][0, 0]
+        size = len(scale)
+        rows, columns = (torch.from_numpy(values[name].copy()) for name in ("rows", "columns"))
+        plane = (-1, -1, size, size)
+        down, up, prefix = [], [], "model"
+        for i in range(depth(size)):
+            first, last = (0, 3) if i == 0 else (1, 3 if i == depth(size) - 1 else 5)
+            for layers, index in ((down, first), (up, last)):
+                name = f"{prefix}.model.{index}"
+                layers.append((values[f"{name}.weight"], values[f"{name}.bias"]))
+            prefix = f"{prefix}.model.{1 if i == 0 else 3}"
+        encoding = torch.cat([rows.expand(plane), columns.expand(plane)], 1)
+        return cls(size, scale > 0, scale.max(), values["metres"], encoding, down, up)
+
+    @property
+    def depth(self) -> int:
+        return len(self.down)
+
+    def first_layer(self) -> dict[str, np.ndarray]:
+        """The first layer with its constant inputs summed up. They depend on the row, or on the column, but
+        at the border, where a column, or a row, of the kernel hangs over.
+        """
+        weight, bias = (torch.from_numpy(x.astype(np.float64)) for x in self.down[0])
+        half = self.encoding.shape[1] // 2
+        rows, columns = (
+            functional.conv2d(part.double(), kernel, stride=2, padding=1)[0]
+            for part, kernel in (
+                (self.encoding[:, :half], weight[:, 3 : 3 + half]),
+                (self.encoding[:, half:], weight[:, 3 + half :]),
+            )
+        )
+        rows = rows[:, :, [0, 1, -1]] + bias[:, None, None]
+        tables = {
+            "down0.weight": weight[:, :3] * float(self.per_metre),
+            "down0.rows": rows.permute(2, 1, 0),
+            "down0.columns": columns[:, [0, 1, -1], :].permute(1, 2, 0),
+        }
+        return {name: np.ascontiguousarray(value.numpy(), np.float32) for name, value in tables.items()}
+
+    def sample(self, offsets: torch.Tensor) -> dict[str, np.ndarray]:
+        """Values [n, C] of what each layer hands to its activation, n at most SAMPLES."""
+        taken: dict[str, list[np.ndarray]] = {}
+        share = max(1, SAMPLES // len(offsets))
+        rng = np.random.default_rng(0)
+        for one in offsets:
+            for name, value in self.forward(one).items():
+                flat = value[0].flatten(1).T.numpy()
+                kept = rng.permutation(len(flat))[:share]
+                taken.setdefault(name, []).append(flat[kept])
+        return {name: np.concatenate(values) for name, values in taken.items()}
+
+    def forward(self, offsets: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Offsets [3, S, S] -> by layer what it hands to its activation, [1, C, H, W]."""
+        values: dict[str, torch.Tensor] = {}
+        scaled = offsets[None] * torch.from_numpy(self.mask.astype(np.float32) * self.per_metre)
+        x = torch.cat([scaled, self.encoding], 1)
+        for i, (weight, bias) in enumerate(self.down):
+            x = functional.conv2d(x, torch.from_numpy(weight), torch.from_numpy(bias), stride=2, padding=1)
+            if 0 < i < self.depth - 1:
+                x = functional.instance_norm(x, eps=NORM_EPS)
+            values[f"down{i}"] = x
+            x = functional.leaky_relu(x, LEAK)
+        x = values[f"down{self.depth - 1}"]
+        for i in reversed(range(1, self.depth)):
+            weight, bias = (torch.from_numpy(v) for v in self.up[i])
+            x = functional.conv_transpose2d(x.relu(), weight, bias, stride=2, padding=1)
+            values[f"up{i}"] = functional.instance_norm(x, eps=NORM_EPS)
+            x = torch.cat([values[f"down{i - 1}"], values[f"up{i}"]], 1)
+        return values
+
+
+def _quantize_weight(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """float32[C, ...] -> int8[C, ...] and the scale per C with the least squared error."""
+    flat = weight.reshape(len(weight), -1)
+    full = np.maximum(np.abs(flat).max(1) / WEIGHT_MAX, SMALLEST_SCALE).astype(np.float32)
+    best, scale = np.full(len(flat), np.inf), full
+    for share in RANGES:
+        tried = np.maximum(full * share, np.float32(SMALLEST_SCALE))[:, None]
+        error = (((flat / tried).round().clip(-WEIGHT_MAX, WEIGHT_MAX) * tried - flat) ** 2).sum(1)
+        scale = np.where(error < best, tried[:, 0], scale)
+        best = np.minimum(best, error)
+    quantized = (flat / scale[:, None]).round().clip(-WEIGHT_MAX, WEIGHT_MAX).astype(np.int8)
+    return quantized.reshape(weight.shape), scale.astype(np.float32)
+
+
+def _leaky_range(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Scale and zero per channel for LeakyReLU of samples [n, C]."""
+    x = np.maximum(x, LEAK * x)
+    return _best_range(x, np.minimum(x.min(0), 0), np.maximum(x.max(0), 0))
+
+
+def _relu_range(x: np.ndarray) -> np.ndarray:
+    """Scale per channel for ReLU of samples [n, C]."""
+    x = np.maximum(x, 0)
+    return _best_range(x, np.zeros(x.shape[1], np.float32), x.max(0))[0]
+
+
+def _best_range(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The range between `low` and `high` whose 256 steps have the least squared error on x [n, C]."""
+    full = np.maximum((high - low) / 255, 1e-6).astype(np.float32)
+    zero = (-low / full).round()
+    best, scale = np.full(x.shape[1], np.inf), full
+    for share in RANGES:
+        tried = full * share
+        q = ((x / tried).round() + zero).clip(0, 255)
+        error = (((q - zero) * tried - x) ** 2).sum(0)
+        scale = np.where(error < best, tried, scale)
+        best = np.minimum(best, error)
+    return scale.astype(np.float32), zero.astype(np.uint8)

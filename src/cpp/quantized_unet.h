@@ -1,0 +1,62 @@
+// The deformation U-Net (facts 20-24) in 8-bit integers: offsets on the UV grid in, a correction of the grid's vertices out.
+//
+// Layers are numbered from the outside: down 0 halves `size` pixels, up 0 doubles to them. Down 0 runs in float, everything else
+// multiplies uint8 activations with int8 weights. What the numbers mean is in cap4d/bundle/quantized_unet.py.
+#pragma once
+#include <cstdint>
+#include <memory>
+#include <span>
+#include <vector>
+
+namespace cap4d {
+
+// uint8 = round(activation / scale) + zero, per channel.
+struct ActivationTensors {
+  std::span<const float> leaky_scale;        // [C] of LeakyReLU's output; empty for the innermost layer
+  std::span<const std::uint8_t> leaky_zero;  // [C]
+  std::span<const float> relu_scale;         // [C] of ReLU's output
+};
+
+struct DownTensors {
+  std::span<const std::int8_t> weight;  // [C, inputs, 4, 4]
+  std::span<const float> scale;         // [C] of the sum
+  std::span<const float> bias;          // [C]; the innermost layer only
+  ActivationTensors out;
+};
+
+struct UpTensors {
+  std::span<const std::int8_t> weight;  // [inputs, C, 4, 4]
+  std::span<const float> scale;         // [C]
+  std::span<const float> relu_scale;    // [C]; not of up 0
+  std::span<const float> bias;          // [3] m; up 0 only
+};
+
+struct UnetTensors {
+  int size, width;
+  std::span<const std::uint8_t> mask;     // [size, size]
+  std::span<const float> weight;          // [width, 3, 4, 4] of down 0, 1/m
+  std::span<const float> rows, columns;   // [3, size / 2, width]
+  ActivationTensors out;                  // of down 0
+  std::vector<DownTensors> down;          // 1, 2, ..
+  std::vector<UpTensors> up;              // 0, 1, ..
+};
+
+int unet_depth(int size);                            // how often a grid is halved: to 2 px, at most 6 times
+int unet_channels(int width, int layer);             // outputs of down `layer`
+inline constexpr int kMaxUnetWidth = 256;            // sums of 8 x width x 32 products stay below 2^31
+
+class QuantizedUnet {
+ public:
+  // Spans need not outlive the call. Throws std::invalid_argument when a size is wrong.
+  explicit QuantizedUnet(const UnetTensors& tensors);
+  ~QuantizedUnet();
+  int size() const;
+  // offsets, out: [3, size, size] m. Calls from several threads wait for each other.
+  void run(const float* offsets, int threads, float* out);
+
+ private:
+  struct Impl;
+  std::unique_ptr<Impl> impl_;
+};
+
+}  // namespace cap4d
