@@ -1,6 +1,7 @@
 # make demo   build everything and play an avatar of the built-in head
 # make test   build everything and run the tests
-# Both do all their own set-up (a virtual environment in .venv; Debian packages through apt when root) and are quick the second time.
+# make sanitize   run what exercises the C++ under AddressSanitizer and UndefinedBehaviorSanitizer (GCC), on each instruction set
+# They do all their own set-up (a virtual environment in .venv; Debian packages through apt when root) and are quick the second time.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -8,7 +9,15 @@ PIP := $(BIN)/pip --disable-pip-version-check --quiet
 APT_PACKAGES := g++ python3-venv python3-dev libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers libvulkan1 xvfb xauth
 CPP := CMakeLists.txt pyproject.toml $(wildcard src/cpp/*)
 
-.PHONY: demo test bench lint clean
+# The C++ again with every access and every conversion checked, in an environment of its own that borrows the packages of the first.
+# Python itself is not built so: the checkers are loaded before it, and its own leaks are none of our business.
+SANITIZED := build/sanitize
+SANITIZERS := -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer -g -O1
+SANITIZED_TESTS := $(wildcard tests/property/test_hard_*.py) $(addprefix tests/,$(addsuffix .py,property/test_splatting_gradients \
+  $(addprefix parity/test_,quantized_answers splatting) \
+  $(addprefix unit/test_,avatar_bound bind mesh player_avatar quantized_unet raster render sort splatter)))
+
+.PHONY: demo test bench lint sanitize sanitize-base sanitize-v3 sanitize-v4 sanitize-threads clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/built
@@ -44,6 +53,31 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/system
 $(VENV)/built: $(VENV)/installed $(CPP)
 	$(PIP) install --no-build-isolation --no-deps --editable .
 	@touch $@
+
+sanitize: $(SANITIZED)/built
+	@$(MAKE) --no-print-directory -j2 --output-sync=target $(addprefix sanitize-,base v3 v4 threads)
+
+# Captured at sys level: what the checkers write last must not end in pytest's temporary file.
+sanitize-base sanitize-v3 sanitize-v4: sanitize-%: $(SANITIZED)/built
+	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so.6)" ASAN_OPTIONS=detect_leaks=0 \
+	  UBSAN_OPTIONS=print_stacktrace=1 OMP_NUM_THREADS=1 CAP4D_ISA=$* $(SANITIZED)/bin/python -m pytest -p no:cacheprovider --capture=sys \
+	  -k "not hard_cases_hold_on and not reference_gradients" $(SANITIZED_TESTS)
+
+sanitize-threads: $(SANITIZED)/thread_pool
+	$<
+
+$(SANITIZED)/built: $(VENV)/installed $(CPP) Makefile
+	$(BIN)/python -m venv --without-pip $(SANITIZED)
+	$(BIN)/python -c 'import sys; print(*(p for p in sys.path if p.endswith("site-packages")), sep="\n")' \
+	  > "$$($(SANITIZED)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"
+	CXX=$(CXX) $(PIP) --python $(SANITIZED)/bin/python install --no-build-isolation --no-deps --editable . \
+	  --config-settings=build-dir=$(SANITIZED)/cmake --config-settings=cmake.build-type=Sanitize --config-settings=install.strip=false \
+	  --config-settings=cmake.define.CMAKE_CXX_FLAGS="$(SANITIZERS)"
+	@touch $@
+
+$(SANITIZED)/thread_pool: tests/cpp/thread_pool.cpp src/cpp/parallel.cpp src/cpp/parallel.h
+	@mkdir -p $(SANITIZED)
+	$(CXX) -std=c++20 -fsanitize=thread -g -O1 -Isrc/cpp -pthread $(filter %.cpp,$^) -o $@
 
 clean:
 	rm -rf build out $(VENV)

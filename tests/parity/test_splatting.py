@@ -26,7 +26,7 @@ def leaves(gaussians: Gaussians) -> list[torch.Tensor]:
     return [torch.from_numpy(getattr(gaussians, name)).clone().requires_grad_() for name in FIELDS]
 
 
-def near_flip(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def near_flip(gaussians: Gaussians, camera: Camera, *, margin: float = tol.FLIP_MARGIN) -> np.ndarray:
     """bool[H, W]: pixels where float32 may decide otherwise than float64."""
     means, quats, scales, opacities, sh = (torch.from_numpy(getattr(gaussians, n)).double() for n in FIELDS)
     keep = reference.drawable(means, quats, scales, opacities, sh[:, 0], camera)
@@ -39,8 +39,8 @@ def near_flip(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     raw = opacities[p.ids] * torch.exp(-(a * dx * dx + c * dy * dy) / 2 - b * dx * dy)
     alphas = reference.pixel_alphas(p.means2d, p.conics, opacities[p.ids], pixels)
     through = torch.cumprod(1 - alphas, 1)
-    faint = ((raw / reference.ALPHA_MIN - 1).abs() < tol.FLIP_MARGIN).any(1)
-    ending = ((through / reference.TRANSMITTANCE_MIN - 1).abs() < tol.FLIP_MARGIN).any(1)
+    faint = ((raw / reference.ALPHA_MIN - 1).abs() < margin).any(1)
+    ending = ((through / reference.TRANSMITTANCE_MIN - 1).abs() < margin).any(1)
     return (faint | ending).reshape(camera.height, camera.width).numpy()
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+
 from cap4d.app.options import parse_options
 
 

@@ -1,6 +1,7 @@
 """The clip on the wall clock."""
 
 import pytest
+
 from cap4d.app.play_clock import PlayClock
 
 
