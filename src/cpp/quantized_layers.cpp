@@ -21,13 +21,22 @@ namespace {
 // Without VNNI bytes are widened to 16 bits: the even ones and the odd ones of each lane separately, so that neither needs a shuffle.
 // pmaddubsw would be shorter, but saturates.
 
-#if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
+#if (defined(CAP4D_AVX512) && defined(__AVX512VNNI__)) || (!defined(CAP4D_AVX512) && defined(__AVXVNNI__))
+#define CAP4D_VNNI 1
+#endif
+
+#ifdef CAP4D_VNNI
 typedef IntV Weights;
 typedef IntV Inputs;
 CAP4D_INLINE Weights unpack(IntV w) { return w; }
-CAP4D_INLINE Inputs spread(std::int32_t four) { return reinterpret_cast<IntV>(_mm512_set1_epi32(four)); }
+CAP4D_INLINE Inputs split(IntV all) { return all; }
+CAP4D_INLINE Inputs spread(std::int32_t four) { return four - IntV{}; }
 CAP4D_INLINE IntV dot4(IntV sum, Inputs a, const Weights& w) {
+#ifdef CAP4D_AVX512
   return reinterpret_cast<IntV>(_mm512_dpbusd_epi32(reinterpret_cast<__m512i>(sum), reinterpret_cast<__m512i>(a), reinterpret_cast<__m512i>(w)));
+#else
+  return reinterpret_cast<IntV>(_mm256_dpbusd_avx_epi32(reinterpret_cast<__m256i>(sum), reinterpret_cast<__m256i>(a), reinterpret_cast<__m256i>(w)));
+#endif
 }
 #else
 struct Weights {
@@ -83,6 +92,7 @@ constexpr int kTilePixels = 12, kTileVectors = 2;
 #else
 constexpr int kTilePixels = 4, kTileVectors = 2;
 #endif
+static_assert(kTilePixels % 4 == 0);  // what is left over is a multiple of 4
 
 template <int kPixels, int kVectors>
 CAP4D_INLINE void dot_tile(const DotJob& job, std::size_t first, int column) {
@@ -281,11 +291,7 @@ CAP4D_INLINE Inputs spread16(const std::uint8_t* p) {
 #else
   const IntV all = load_int(p);
 #endif
-#if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
-  return all;
-#else
   return split(all);
-#endif
 }
 
 // What the input pixel kRow rows and kColumn columns from the upper left one adds to the outputs of each parity that it reaches.
