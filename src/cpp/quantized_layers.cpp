@@ -173,7 +173,8 @@ CAP4D_INLINE Quantum quantum(const Requantizer& to, int channel) {
   return to.image ? Quantum{load(to.inverse_scale + channel), load(to.zero + channel)} : Quantum{};
 }
 
-CAP4D_INLINE void activate(FloatV x, const Requantizer& leaky, const Quantum& leaky_q, const Requantizer& relu, const Quantum& relu_q, std::size_t at) {
+CAP4D_INLINE void activate(FloatV x, const Requantizer& leaky, const Quantum& leaky_q, const Requantizer& relu, const Quantum& relu_q,
+                           std::size_t at) {
   if (leaky.image) store_bytes(leaky.image + at, max(x, x * kLeak) * leaky_q.inverse_scale + leaky_q.zero);
   if (relu.image) store_bytes(relu.image + at, max(x, FloatV{}) * relu_q.inverse_scale + relu_q.zero);
 }
@@ -296,7 +297,8 @@ CAP4D_INLINE Inputs spread16(const std::uint8_t* p) {
 
 // What the input pixel kRow rows and kColumn columns from the upper left one adds to the outputs of each parity that it reaches.
 template <int kRow, int kColumn>
-CAP4D_INLINE const std::int8_t* last_neighbour(const LastJob& job, const std::uint8_t* pixel, const std::int8_t* weights, IntV sum[kLastPixels][kParities]) {
+CAP4D_INLINE const std::int8_t* last_neighbour(const LastJob& job, const std::uint8_t* pixel, const std::int8_t* weights,
+                                               IntV sum[kLastPixels][kParities]) {
   const std::uint8_t* input = pixel + (static_cast<std::size_t>(kRow) * (job.size / 2 + 2) + kColumn) * job.channels;
   for (int k = 0; k < job.channels; k += 4 * kGroups) {
     Inputs a[kLastPixels];
