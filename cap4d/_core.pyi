@@ -110,7 +110,7 @@ class QuantizedUnet:
     other.
     """
 
-    isa: ClassVar[Literal["base", "v3", "v4", "vnni"]]
+    isa: ClassVar[Literal["base", "v3", "avxvnni", "v4", "vnni"]]
     """The variant of the inner loops in use."""
 
     def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:

@@ -21,13 +21,22 @@ namespace {
 // Without VNNI bytes are widened to 16 bits: the even ones and the odd ones of each lane separately, so that neither needs a shuffle.
 // pmaddubsw would be shorter, but saturates.
 
-#if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
+#if (defined(CAP4D_AVX512) && defined(__AVX512VNNI__)) || (!defined(CAP4D_AVX512) && defined(__AVXVNNI__))
+#define CAP4D_VNNI 1
+#endif
+
+#ifdef CAP4D_VNNI
 typedef IntV Weights;
 typedef IntV Inputs;
 CAP4D_INLINE Weights unpack(IntV w) { return w; }
-CAP4D_INLINE Inputs spread(std::int32_t four) { return reinterpret_cast<IntV>(_mm512_set1_epi32(four)); }
+CAP4D_INLINE Inputs split(IntV all) { return all; }
+CAP4D_INLINE Inputs spread(std::int32_t four) { return four - IntV{}; }
 CAP4D_INLINE IntV dot4(IntV sum, Inputs a, const Weights& w) {
+#ifdef CAP4D_AVX512
   return reinterpret_cast<IntV>(_mm512_dpbusd_epi32(reinterpret_cast<__m512i>(sum), reinterpret_cast<__m512i>(a), reinterpret_cast<__m512i>(w)));
+#else
+  return reinterpret_cast<IntV>(_mm256_dpbusd_avx_epi32(reinterpret_cast<__m256i>(sum), reinterpret_cast<__m256i>(a), reinterpret_cast<__m256i>(w)));
+#endif
 }
 #else
 struct Weights {
@@ -83,6 +92,7 @@ constexpr int kTilePixels = 12, kTileVectors = 2;
 #else
 constexpr int kTilePixels = 4, kTileVectors = 2;
 #endif
+static_assert(kTilePixels % 4 == 0);  // what is left over is a multiple of 4
 
 template <int kPixels, int kVectors>
 CAP4D_INLINE void dot_tile(const DotJob& job, std::size_t first, int column) {
@@ -163,7 +173,8 @@ CAP4D_INLINE Quantum quantum(const Requantizer& to, int channel) {
   return to.image ? Quantum{load(to.inverse_scale + channel), load(to.zero + channel)} : Quantum{};
 }
 
-CAP4D_INLINE void activate(FloatV x, const Requantizer& leaky, const Quantum& leaky_q, const Requantizer& relu, const Quantum& relu_q, std::size_t at) {
+CAP4D_INLINE void activate(FloatV x, const Requantizer& leaky, const Quantum& leaky_q, const Requantizer& relu, const Quantum& relu_q,
+                           std::size_t at) {
   if (leaky.image) store_bytes(leaky.image + at, max(x, x * kLeak) * leaky_q.inverse_scale + leaky_q.zero);
   if (relu.image) store_bytes(relu.image + at, max(x, FloatV{}) * relu_q.inverse_scale + relu_q.zero);
 }
@@ -281,16 +292,13 @@ CAP4D_INLINE Inputs spread16(const std::uint8_t* p) {
 #else
   const IntV all = load_int(p);
 #endif
-#if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
-  return all;
-#else
   return split(all);
-#endif
 }
 
 // What the input pixel kRow rows and kColumn columns from the upper left one adds to the outputs of each parity that it reaches.
 template <int kRow, int kColumn>
-CAP4D_INLINE const std::int8_t* last_neighbour(const LastJob& job, const std::uint8_t* pixel, const std::int8_t* weights, IntV sum[kLastPixels][kParities]) {
+CAP4D_INLINE const std::int8_t* last_neighbour(const LastJob& job, const std::uint8_t* pixel, const std::int8_t* weights,
+                                               IntV sum[kLastPixels][kParities]) {
   const std::uint8_t* input = pixel + (static_cast<std::size_t>(kRow) * (job.size / 2 + 2) + kColumn) * job.channels;
   for (int k = 0; k < job.channels; k += 4 * kGroups) {
     Inputs a[kLastPixels];
