@@ -172,11 +172,11 @@ class Splatter:
         """Memory held."""
     @property
     def seconds(self) -> dict[str, float]:
-        """Of the last picture: bind, project, sort, tiles, rasterize."""
+        """Of the last picture or order: bind, project, sort, tiles, rasterize."""
 
 @final
 class GridSurface:
-    """The head on the grid's G vertices: basis [K, G, 3] (expressions, pose correctives), skin_weights [J, G]."""
+    """The head on the grid's G vertices: basis [K, G, 3] (expressions, correctives), skin_weights [J, G]."""
 
     def __init__(
         self,

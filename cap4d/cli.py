@@ -436,6 +436,9 @@ def add_render(commands) -> None:
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="out.mp4, frame_%%04d.png or one.png"
     )
+    parser.add_argument(
+        "--pipeline", action="store_true", help="work out the next frame's face while a frame is drawn"
+    )
     parser.add_argument("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
 
 
@@ -454,6 +457,7 @@ def run_render(arguments: argparse.Namespace) -> None:
         frames=arguments.frames,
         stats=arguments.stats,
         deformer=arguments.deformer,
+        pipelined=arguments.pipeline,
     )
 
 

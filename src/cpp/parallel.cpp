@@ -1,4 +1,4 @@
-// A small persistent pool behind parallel_for. One job runs at a time; nested calls run on the calling thread.
+// A small persistent pool behind parallel_for. It runs one job at a time; a caller that finds it at work, and nested calls, work alone.
 #include "parallel.h"
 
 #include <algorithm>
@@ -43,8 +43,10 @@ struct Job {
 
 class Pool {
  public:
-  void run(Job& job, int helpers) {
-    std::unique_lock busy(busy_mutex_);
+  // False, and nothing done, while another caller's job runs.
+  bool run(Job& job, int helpers) {
+    std::unique_lock busy(busy_mutex_, std::try_to_lock);
+    if (!busy) return false;
     {
       std::lock_guard lock(mutex_);
       while (static_cast<int>(workers_.size()) < helpers) workers_.emplace_back([this] { work(); });
@@ -58,6 +60,7 @@ class Pool {
     wanted_ = 0;  // a worker that has not started yet need not
     done_.wait(lock, [this] { return active_ == 0; });
     job_ = nullptr;
+    return true;
   }
 
   ~Pool() {
@@ -120,7 +123,7 @@ void parallel_for(std::size_t n, std::size_t grain, int threads, const std::func
   }
   Job job;
   job.n = n, job.grain = grain, job.body = &body;
-  pool().run(job, helpers);
+  if (!pool().run(job, helpers)) job.run();
   if (job.error) std::rethrow_exception(job.error);
 }
 
