@@ -4,11 +4,12 @@ how far apart the answers are.
     python -m pytest -m bench -s tests/bench/bench_deformer.py
     CAP4D_BENCH_AVATARS=me.cap4d:you.cap4d python -m pytest -m bench -s tests/bench/bench_deformer.py
 
-Two threads; calls of all variants take turns, so that what else the machine does hits all alike. The networks
-are those of the avatars named in the environment, asked for the frames of their idle clips, and without any,
+Two threads; variants take turns with a few frames each, so that what else the machine does hits all alike.
+The first frame of a turn warms the caches and is not counted. Before each turn the threads of onnxruntime's
+spinning variant get the time to fall asleep; else they take a core from whoever comes next. The networks are
+those of the avatars named in the environment, asked for the frames of their idle clips, and without any,
 networks of the released size and of a quarter of its width, trained for a moment to a smooth answer of their
-own. Half of the frames calibrate, errors are those of the other half. The floor is the integers' products at
-the rate that this processor's VNNI unit can do at its measured clock, two threads.
+own. Half of the frames calibrate, errors are those of the other half.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ from cap4d.rig.head import Subject
 from cap4d.synth.idle import idle_clip
 
 pytestmark = pytest.mark.bench
-THREADS, ROUNDS, FRAMES = 2, 40, 48
+THREADS, ROUNDS, TURN, FRAMES = 2, 12, 5, 48
+PAUSE = 0.05  # s
+RMS_MM, MOST_MM = 0.02, 0.2  # of vertices that may move
 WANTED_RATIO = 2.5  # of onnxruntime's median to ours
 Call = Callable[[np.ndarray], np.ndarray]
 
@@ -70,7 +73,7 @@ def trained(width: int, *, steps: int = 60) -> tuple[bytes, np.ndarray, np.ndarr
     targets = 0.4 * offsets.roll(1, 1) + 0.02 * DEFORM_STD * net.encoding[None, [0, 14, 7]]
     rng = np.random.default_rng(0)
     for _ in range(steps):
-        chosen = rng.choice(FRAMES, 4, replace=False)
+        chosen = rng.choice(FRAMES, 2, replace=False)
         loss = ((net(offsets[chosen]) - targets[chosen]) / DEFORM_STD).square().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -123,13 +126,14 @@ def test_deformer(case: Callable[[], tuple[bytes, np.ndarray, np.ndarray]]) -> N
         "int8, one thread": lambda offsets: unet.run(offsets, 1),
     }
     times: dict[str, list[float]] = {name: [] for name in calls}
-    for i in range(ROUNDS + 2):
+    for turn in range(ROUNDS):
         for name, call in calls.items():
-            if "spinning" not in name:
-                time.sleep(0.002)  # threads that spun have gone to sleep
-            start = time.perf_counter()
-            call(maps[i % FRAMES])
-            times[name].append(time.perf_counter() - start)
+            time.sleep(PAUSE)
+            for i in range(TURN):
+                start = time.perf_counter()
+                call(maps[(TURN * turn + i) % FRAMES])
+                if i > 0:
+                    times[name].append(time.perf_counter() - start)
     float32 = calls["onnxruntime float32"]
     expected = np.stack([float32(m) for m in maps[1::2]])
     found = np.stack([unet.run(m, THREADS) for m in maps[1::2]])
@@ -139,7 +143,7 @@ def test_deformer(case: Callable[[], tuple[bytes, np.ndarray, np.ndarray]]) -> N
     print(f"\n{len(tensors['down0.weight'])} wide, {products(tensors, size) / 1e9:.3f} G integer products")
     medians = {}
     for name, values in times.items():
-        ms = 1e3 * np.array(values[2:])
+        ms = 1e3 * np.array(values)
         medians[name] = float(np.median(ms))
         print(f"{name:>30}: median {medians[name]:7.3f} ms, 95 % {np.percentile(ms, 95):7.3f}", end="")
         print(f", {medians['onnxruntime float32, spinning'] / medians[name]:5.2f} x")
@@ -147,4 +151,5 @@ def test_deformer(case: Callable[[], tuple[bytes, np.ndarray, np.ndarray]]) -> N
     print(f"; the answer moves by {rms(motion):.3f} mm RMS, {motion.max():.3f} mm at most")
     plain = min(medians["onnxruntime float32, spinning"], medians["onnxruntime float32"])
     assert plain / medians[f"int8 ({unet.isa})"] >= WANTED_RATIO
-    assert rms(error) < 0.05 * rms(motion)
+    assert rms(error) < RMS_MM
+    assert error.max() < MOST_MM
