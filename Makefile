@@ -13,8 +13,9 @@ CPP := CMakeLists.txt pyproject.toml $(wildcard src/cpp/*)
 # Python itself is not built so: the checkers are loaded before it, and its own leaks are none of our business.
 SANITIZED := build/sanitize
 SANITIZERS := -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer -g -O1
-SANITIZED_TESTS := $(wildcard tests/property/test_hard_*.py) tests/parity/test_splatting.py tests/property/test_splatting_gradients.py \
-  $(addprefix tests/unit/test_,$(addsuffix .py,avatar_bound bind mesh player_avatar raster render sort))
+SANITIZED_TESTS := $(wildcard tests/property/test_hard_*.py) $(addprefix tests/,$(addsuffix .py,property/test_splatting_gradients \
+  $(addprefix parity/test_,quantized_answers splatting) \
+  $(addprefix unit/test_,avatar_bound bind mesh player_avatar quantized_unet raster render sort splatter)))
 
 .PHONY: demo test bench lint sanitize sanitize-base sanitize-v3 sanitize-v4 sanitize-threads clean
 .DELETE_ON_ERROR:

@@ -222,6 +222,14 @@ def strip(width: int, height: int) -> Scene:
     return gaussians(**fields), frontal(width, height, focal=float(max(width, height)))
 
 
+def scene_around(victim: int) -> Scene:
+    """20 Gaussians of degree 3 about one that is straight ahead, where most basis functions are 0."""
+    clouds, camera = cloud(20, seed=50), frontal(33, 29, focal=70.0)
+    means = clouds.means + np.float32([0, 0, 1])
+    means[victim] = [0, 0, 0.3]
+    return Gaussians(means, clouds.quats, clouds.scales, clouds.opacities, clouds.sh), camera
+
+
 SCENES: dict[str, Callable[[], Scene]] = {
     "near_plane": near_plane,
     "behind": behind,

@@ -65,11 +65,13 @@ HARD_DEPTH_STEP = 3e-7  # m, by which neighbours in depth may swap 10 km from th
 # Binding to slivers, inverted, tiny and huge triangles, each row relative to its own norm.
 HARD_BIND = 7e-7  # one rounding of the frame, one or two of the product: frames are computed in double
 HARD_BIND_GRADIENT = 3e-5  # plus GRADIENT_FLOOR of the largest row: sums of float32 over a triangle's riders
+HARD_BOUND = 1.2e-5  # pictures of riders: frames in float32 unless the triangle is lower than 1 % of its side
+HARD_BOUND_FAR = 0.1  # 10 km away posed means have steps of half a millimetre, 0.03 px here
 
 # Rotations near the identity and half turns, to matrix, quaternion, vector and back, in steps of the number.
 ROTATION = 25
 
-# The deformation network in 8-bit integers against float32, mm. Random networks that answer 1 mm RMS per axis; trained ones, which
-# are smoother, come five times nearer (bench_deformer).
+# The deformation network in 8-bit integers against float32, mm. Random networks that answer 1 mm RMS per axis;
+# trained ones, which are smoother, come five times nearer (bench_deformer).
 INT8_RMS_MM = 0.08
 INT8_MOST_MM = 0.4

@@ -11,6 +11,7 @@ pytest.importorskip("onnx")
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from parity import tolerances as tol
 from tiny_bundle import EXPRESSIONS, tiny_bundle
 
 from cap4d.bundle import Bundle
@@ -39,6 +40,14 @@ def check(avatar: Avatar, gaussians: Gaussians, camera: Camera | None = None) ->
         assert np.array_equal(getattr(one, name), getattr(two, name)), name
 
 
+def check_frame(avatar: Avatar, expr: np.ndarray, **rotations: np.ndarray) -> None:
+    """The player's own picture of it, made by the prepared splatter, is that of the posed Gaussians."""
+    frame = avatar.render(expr, background=(1.0, 1.0, 1.0), **rotations)
+    exact = render(avatar.pose(expr, **rotations), avatar.camera).rgb.clip(0, 1) * 255
+    steps = np.abs(frame[..., :3] - exact)
+    assert (steps > tol.PLAYER_PICTURE).mean() <= tol.FLIP_SHARE
+
+
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10**6), corner=st.booleans())
 def test_expressions_at_ten_times_their_range(avatar: Avatar, seed: int, corner: bool) -> None:
@@ -48,6 +57,7 @@ def test_expressions_at_ten_times_their_range(avatar: Avatar, seed: int, corner:
     expr = (10 * (low + share * (high - low)) * rng.choice([-1, 1], len(ZERO))).astype(np.float32)
     before = avatar.render(ZERO)
     check(avatar, avatar.pose(expr))
+    check_frame(avatar, expr)
     assert np.abs(avatar.vertices(expr)).max() < 10, "a head of more than 10 m"
     assert np.array_equal(avatar.render(ZERO), before)
 
@@ -61,6 +71,7 @@ def test_any_turn_of_eyes_neck_and_jaw(avatar: Avatar, axis: tuple, angles: tupl
     unit = np.array(axis) / np.linalg.norm(axis)
     eye, neck, jaw = (np.float32(unit * angle) for angle in angles)
     check(avatar, avatar.pose(ZERO, eye_rot=eye, neck_rot=neck, jaw_rot=jaw))
+    check_frame(avatar, ZERO, eye_rot=eye, neck_rot=neck, jaw_rot=jaw)
 
 
 @pytest.mark.parametrize("value", [1e-45, 1e-38, 1e4, 1e10, 1e20, 3e38])

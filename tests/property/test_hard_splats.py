@@ -10,7 +10,7 @@ import os
 import numpy as np
 import pytest
 import torch
-from hard_splats import SCENES, Scene, frontal, gaussians, in_front
+from hard_splats import SCENES, Scene, frontal, gaussians, in_front, scene_around
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from parity import tolerances as tol
@@ -146,14 +146,6 @@ def test_the_same_bits_for_one_and_two_threads(name: str) -> None:
     one, two = (results(*SCENES[name](), threads) for threads in (1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))
     assert all(np.array_equal(a, b) for a, b in zip(one[:3], one[3:6], strict=True)), "play and train differ"
-
-
-def scene_around(victim: int) -> Scene:
-    """20 Gaussians of degree 3 about one that is straight ahead, where most basis functions are 0."""
-    clouds, camera = cloud(20, seed=50), frontal(33, 29, focal=70.0)
-    means = clouds.means + np.float32([0, 0, 1])
-    means[victim] = [0, 0, 0.3]
-    return Gaussians(means, clouds.quats, clouds.scales, clouds.opacities, clouds.sh), camera
 
 
 def check_contained(clouds: Gaussians, camera: Camera, victim: int, *, must_go: bool) -> None:
