@@ -56,7 +56,8 @@ struct PairRun {
 // and opacity.
 struct SplatGrad {
   float red, green, blue, depth;
-  float s, sx, su, sxx, sxu, suu;
+  float s, sx, su, sxx;
+  float sxu, suu, unused[2];
 };
 
 }  // namespace cap4d

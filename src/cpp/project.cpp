@@ -28,11 +28,6 @@ CAP4D_INLINE void gather(const float* items, std::size_t first, int count, Float
   for (int c = 0; c < kComponents; ++c) out[c] = load(lanes[c]);
 }
 
-template <int kComponents>
-CAP4D_INLINE void spread(const FloatV* values, float out[kComponents][kLanes]) {
-  for (int c = 0; c < kComponents; ++c) store(out[c], values[c]);
-}
-
 CAP4D_INLINE Shape3<FloatV> gather_shape(const GaussiansView& g, std::size_t first, int count) {
   Shape3<FloatV> shape;
   gather<3>(g.means, first, count, shape.mean);
@@ -54,8 +49,40 @@ CAP4D_INLINE Direction view_direction(const Camera& camera, const FloatV* mean) 
   return d;
 }
 
-// 0.5 + sum of basis x coefficients, before the clamp at 0. basis [k][lane]. The fourth element is rubbish.
-CAP4D_INLINE Float4 sh_color(const float* sh, int count, const float basis[][kLanes], int lane) {
+constexpr int kShFloats = 3 * kShMax;  // of one Gaussian with all harmonics: a whole number of 8s, and of 16s
+
+// The first 3 `used` floats of kLanes Gaussians' coefficients; those of the last repeat past `count`. `sh` [kShFloats] holds rubbish
+// beyond. Memory is read in order, one Gaussian after the other: 16 rows side by side would be too many streams to foresee.
+CAP4D_INLINE void gather_sh(const GaussiansView& g, int used, std::size_t first, int count, FloatV* sh) {
+  const std::size_t stored = 3 * static_cast<std::size_t>(g.sh_count), wanted = (3 * static_cast<std::size_t>(used) + 7) / 8 * 8;
+  alignas(64) float near[kLanes][kShFloats];
+  const float* rows[kLanes];
+  for (int l = 0; l < kLanes; ++l) {
+    const float* from = g.sh + stored * (first + (l < count ? l : count - 1));
+    rows[l] = near[l];
+    if (stored == kShFloats) std::memcpy(near[l], from, kShFloats * sizeof(float));
+    else std::memcpy(near[l], from, stored * sizeof(float));
+  }
+  for (std::size_t i = 0; i < wanted; i += 8) {
+    load_rows8(rows, sh + i);
+    for (const float*& row : rows) row += 8;
+  }
+}
+
+// Writes `v_sh` [kShFloats], zero beyond what is used, as rows of `out`; in order, as above.
+CAP4D_INLINE void scatter_sh(const FloatV* v_sh, const GaussiansView& g, std::size_t first, int count, float* out) {
+  const std::size_t stored = 3 * static_cast<std::size_t>(g.sh_count);
+  alignas(64) float near[kLanes][kShFloats];
+  for (int i = 0; i < kShFloats; i += 16) store_rows16(v_sh + i, &near[0][i], kShFloats, (1u << count) - 1);
+  for (int l = 0; l < count; ++l) {
+    if (stored == kShFloats) std::memcpy(out + stored * (first + l), near[l], kShFloats * sizeof(float));
+    else std::memcpy(out + stored * (first + l), near[l], stored * sizeof(float));
+  }
+}
+
+// The colour of one Gaussian, the `lane`th of `basis` [k][lane]: 0.5 + sum of basis x coefficients, before the clamp at 0. The fourth
+// element is rubbish. Forward this beats turning the coefficients into registers: nothing else needs them.
+CAP4D_INLINE Float4 sh_color_at(const float* sh, int count, const float basis[][kLanes], int lane) {
   Float4 even = {0.5f, 0.5f, 0.5f, 0.5f}, odd = {};
   const int last = count - 1;
   int k = 0;
@@ -65,6 +92,13 @@ CAP4D_INLINE Float4 sh_color(const float* sh, int count, const float basis[][kLa
   }
   for (; k < last; ++k) even += basis[k][lane] * load4(sh + 3 * k);
   return even + odd + basis[last][lane] * Float4{sh[3 * last], sh[3 * last + 1], sh[3 * last + 2], 0.0f};
+}
+
+// The same of kLanes Gaussians.
+CAP4D_INLINE void sh_color(const FloatV* sh, int used, const FloatV* basis, FloatV* color) {
+  for (int c = 0; c < 3; ++c) color[c] = splat(0.5f);
+  for (int k = 0; k < used; ++k)
+    for (int c = 0; c < 3; ++c) color[c] += basis[k] * sh[3 * k + c];
 }
 
 // Three standard deviations along the longest axis, px, rounded up.
@@ -117,7 +151,7 @@ CAP4D_INLINE void put_splats(const Camera& camera, const Footprint<FloatV>& f, c
   const FloatV fields[16] = {f.x, f.y, e.height, f.xy / f.yy, f.shear * e.width, f.det / f.yy * e.reach, 1.0f / e.height2, exponent,
                              f.inv_xx * (-0.5f * kLog2e), f.inv_uu * (-0.5f * kLog2e), f.shear, max(color[0], zero), max(color[1], zero),
                              max(color[2], zero), f.depth, zero};
-  store_rows16(fields, &splats->x, drawn);
+  store_rows16(fields, &splats->x, sizeof(Splat) / sizeof(float), drawn);
   const TileRange columns = tile_range(f.x - e.width, f.x + e.width, camera.width), rows = tile_range(f.y - e.height, f.y + e.height, camera.height);
   const IntV radius = radius_of(f);
   for (int l = 0; l < count; ++l) {
@@ -152,7 +186,7 @@ void project_fwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     for (int k = 0; k < used; ++k) store(basis[k], basis_v[k]);
     for (std::uint32_t rest = todo; rest; rest &= rest - 1) {
       const int l = __builtin_ctz(rest);
-      const Float4 color = sh_color(g.sh + 3 * g.sh_count * (first + l), used, basis, l);
+      const Float4 color = sh_color_at(g.sh + 3 * g.sh_count * (first + l), used, basis, l);
       for (int c = 0; c < 3; ++c) colors[c][l] = color[c];
     }
     const FloatV color[3] = {load(colors[0]), load(colors[1]), load(colors[2])};
@@ -271,7 +305,7 @@ void triangle_frames(const float* vertices, const std::int32_t* faces, std::size
     for (int i = 0; i < 3; ++i) frame[3 * i] = size * a0[i], frame[3 * i + 1] = size * a1[i], frame[3 * i + 2] = size * a2[i];
     frame[12] = size;
     const std::uint32_t whole = (1u << count) - 1;
-    store_rows16(frame, frames[first].turn, whole & bits(sound));
+    store_rows16(frame, frames[first].turn, sizeof(TriangleFrame) / sizeof(float), whole & bits(sound));
     for (std::uint32_t slivers = whole & ~bits(sound); slivers; slivers &= slivers - 1) {
       const std::size_t id = first + __builtin_ctz(slivers);
       frames[id] = triangle_frame(vertices, faces + 3 * id);
@@ -279,39 +313,51 @@ void triangle_frames(const float* vertices, const std::int32_t* faces, std::size
   }
 }
 
-// Sum of a Gaussian's per-tile gradients, in the order its tiles were listed.
-CAP4D_INLINE SplatGrad total(const PairGrads& pairs, std::size_t id) {
-  SplatGrad sum{};
-  const PairRun run = pairs.runs[id];
-  for (std::uint32_t k = run.first; k < run.first + run.count; ++k) {
-    const SplatGrad& v = pairs.grads[k];
-    sum.red += v.red, sum.green += v.green, sum.blue += v.blue, sum.depth += v.depth;
-    sum.s += v.s, sum.sx += v.sx, sum.su += v.su, sum.sxx += v.sxx, sum.sxu += v.sxu, sum.suu += v.suu;
+// What Gaussians of kLanes received, the sum over their tiles in the order these were listed: the fields of SplatGrad as registers.
+constexpr int kReceived = 16;
+static_assert(sizeof(SplatGrad) == 12 * sizeof(float));
+
+CAP4D_INLINE void gather_received(const PairGrads& pairs, std::size_t first, std::uint32_t drawn, FloatV* received) {
+  typedef float Float8 __attribute__((vector_size(32)));
+  alignas(64) float rows[kLanes][kReceived];
+  for (int l = 0; l < kLanes; ++l) {
+    Float8 low{}, high{};
+    if (drawn >> l & 1) {
+      const PairRun run = pairs.runs[first + l];
+      for (std::uint32_t k = run.first; k < run.first + run.count; ++k) {
+        Float8 more;
+        Float4 rest;
+        std::memcpy(&more, &pairs.grads[k].red, sizeof more);
+        std::memcpy(&rest, &pairs.grads[k].sxu, sizeof rest);
+        low += more;
+        high += Float8{rest[0], rest[1]};
+      }
+    }
+    std::memcpy(rows[l], &low, sizeof low);
+    std::memcpy(rows[l] + 8, &high, sizeof high);
   }
-  return sum;
+  const float *low[kLanes], *high[kLanes];
+  for (int l = 0; l < kLanes; ++l) low[l] = rows[l], high[l] = rows[l] + 8;
+  load_rows8(low, received);
+  load_rows8(high, received + 8);
 }
 
-// Writes v_sh of one Gaussian and its v_basis (per lane); v_color is already masked by the clamp.
-CAP4D_INLINE void sh_color_vjp(const float* sh, int used, int stored, const float basis[][kLanes], int lane, Float4 v_color, float* v_sh,
-                               float v_basis[][kLanes]) {
-  for (int k = 0; k + 1 < used; ++k) {
-    const Float4 product = v_color * load4(sh + 3 * k);
-    v_basis[k][lane] = product[0] + product[1] + product[2];
-    store4(v_sh + 3 * k, basis[k][lane] * v_color);  // the fourth element is overwritten by the next k
+// v_sh [kShFloats] and v_basis [kShMax] from v_color, which is already masked by the clamp.
+CAP4D_INLINE void sh_color_vjp(const FloatV* sh, int used, const FloatV* basis, const FloatV* v_color, FloatV* v_sh, FloatV* v_basis) {
+  for (int k = 0; k < used; ++k) {
+    for (int c = 0; c < 3; ++c) v_sh[3 * k + c] = basis[k] * v_color[c];
+    v_basis[k] = v_color[0] * sh[3 * k] + v_color[1] * sh[3 * k + 1] + v_color[2] * sh[3 * k + 2];
   }
-  const int last = used - 1;
-  float sum = 0;
-  for (int c = 0; c < 3; ++c) {
-    v_sh[3 * last + c] = basis[last][lane] * v_color[c];
-    sum += sh[3 * last + c] * v_color[c];
-  }
-  v_basis[last][lane] = sum;
-  for (int i = 3 * used; i < 3 * stored; ++i) v_sh[i] = 0;
+  for (int i = 3 * used; i < kShFloats; ++i) v_sh[i] = FloatV{};
 }
 
+// Rows of kComponents floats from registers, those of `drawn`, and zeros for the others: their lanes may hold anything.
 template <int kComponents>
-CAP4D_INLINE void put(float* items, std::size_t id, const float values[kComponents][kLanes], int lane) {
-  for (int c = 0; c < kComponents; ++c) items[kComponents * id + c] = values[c][lane];
+CAP4D_INLINE void scatter(const FloatV* values, MaskV drawn, std::size_t first, int count, float* items) {
+  float lanes[kComponents][kLanes];
+  for (int c = 0; c < kComponents; ++c) store(lanes[c], keep(drawn, values[c]));
+  for (int l = 0; l < count; ++l)
+    for (int c = 0; c < kComponents; ++c) items[kComponents * (first + l) + c] = lanes[c][l];
 }
 
 void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin, std::size_t end, const std::int32_t* radii,
@@ -319,13 +365,11 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
   const int used = (g.sh_degree + 1) * (g.sh_degree + 1);
   for (std::size_t first = begin; first < end; first += kLanes) {
     const int count = static_cast<int>(std::min<std::size_t>(kLanes, end - first));
-    float received[10][kLanes] = {};
-    for (int l = 0; l < count; ++l) {
-      if (radii[first + l] == 0) continue;
-      const SplatGrad v = total(pairs, first + l);
-      const float values[10] = {v.red, v.green, v.blue, v.depth, v.s, v.sx, v.su, v.sxx, v.sxu, v.suu};
-      for (int c = 0; c < 10; ++c) received[c][l] = values[c];
-    }
+    std::uint32_t which = 0;
+    for (int l = 0; l < count; ++l) which |= static_cast<std::uint32_t>(radii[first + l] > 0) << l;
+    const MaskV drawn = mask_of(which);
+    FloatV received[kReceived];
+    gather_received(pairs, first, which, received);
     const Shape3<FloatV> shape = gather_shape(g, first, count);
     FloatV opacity;
     gather<1>(g.opacities, first, count, &opacity);
@@ -333,32 +377,22 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     const Footprint<FloatV>& f = p.footprint;
     // d(ln density) = covariance^-1 d . d(mean) + (covariance^-1 d)^T d(covariance) (covariance^-1 d) / 2, and the inverse is diagonal
     // in (dx, u).
-    const FloatV v_y = f.inv_uu * load(received[6]);
-    const FootprintGrad<FloatV> v = {f.inv_xx * load(received[5]) - f.shear * v_y, v_y, load(received[3]),
-                                     0.5f * f.inv_xx * (f.inv_xx * load(received[7])), 0.5f * f.inv_xx * (f.inv_uu * load(received[8])),
-                                     0.5f * f.inv_uu * (f.inv_uu * load(received[9]))};
+    const FloatV v_y = f.inv_uu * received[6];
+    const FootprintGrad<FloatV> v = {f.inv_xx * received[5] - f.shear * v_y, v_y, received[3],
+                                     0.5f * f.inv_xx * (f.inv_xx * received[7]), 0.5f * f.inv_xx * (f.inv_uu * received[8]),
+                                     0.5f * f.inv_uu * (f.inv_uu * received[9])};
     Shape3<FloatV> v_shape = project_vjp(camera, shape, p, v);
 
     const Direction direction = view_direction(camera, shape.mean);
-    FloatV basis_v[kShMax], v_basis_v[kShMax], v_unit[3];
-    sh_basis(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], basis_v);
-    float basis[kShMax][kLanes], v_basis[kShMax][kLanes] = {};
-    for (int k = 0; k < used; ++k) store(basis[k], basis_v[k]);
-    for (int l = 0; l < count; ++l) {
-      const std::size_t id = first + l;
-      float* v_sh = out.sh + 3 * g.sh_count * id;
-      if (radii[id] == 0) {
-        std::fill_n(v_sh, 3 * g.sh_count, 0.0f);
-        continue;
-      }
-      const float* sh = g.sh + 3 * g.sh_count * id;
-      const Float4 color = sh_color(sh, used, basis, l);
-      const Float4 v_color = {color[0] > 0 ? received[0][l] : 0.0f, color[1] > 0 ? received[1][l] : 0.0f, color[2] > 0 ? received[2][l] : 0.0f,
-                              0.0f};
-      sh_color_vjp(sh, used, g.sh_count, basis, l, v_color, v_sh, v_basis);
-    }
-    for (int k = 0; k < used; ++k) v_basis_v[k] = load(v_basis[k]);
-    sh_basis_vjp(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], v_basis_v, v_unit);
+    FloatV basis[kShMax], sh[kShFloats], color[3], v_color[3], v_basis[kShMax], v_sh[kShFloats], v_unit[3];
+    sh_basis(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], basis);
+    gather_sh(g, used, first, count, sh);
+    sh_color(sh, used, basis, color);
+    for (int c = 0; c < 3; ++c) v_color[c] = keep(both(drawn, less(splat(0.0f), color[c])), received[c]);
+    sh_color_vjp(sh, used, basis, v_color, v_sh, v_basis);
+    for (int i = 0; i < 3 * used; ++i) v_sh[i] = keep(drawn, v_sh[i]);
+    scatter_sh(v_sh, g, first, count, out.sh);
+    sh_basis_vjp(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], v_basis, v_unit);
     // Where a basis function is 0, its coefficient may be anything that is a number and the colour still sane.
     const MaskV fits = less(absolute(v_unit[0]) + absolute(v_unit[1]) + absolute(v_unit[2]), splat(1e30f));  // false for NaN
     for (int i = 0; i < 3; ++i) v_unit[i] = keep(fits, v_unit[i]);
@@ -366,30 +400,12 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     for (int i = 0; i < 3; ++i)
       v_shape.mean[i] = v_shape.mean[i] + (v_unit[i] - along * direction.unit[i]) * direction.inverse_norm;
 
-    const FloatV v_opacity_v = load(received[4]) / opacity;
-    const FloatV v_means2d_v[2] = {v.x, v.y};
-    float v_means[3][kLanes], v_quats[4][kLanes], v_scales[3][kLanes], v_means2d[2][kLanes], v_opacity[1][kLanes];
-    spread<3>(v_shape.mean, v_means);
-    spread<4>(v_shape.quat, v_quats);
-    spread<3>(v_shape.scale, v_scales);
-    spread<2>(v_means2d_v, v_means2d);
-    spread<1>(&v_opacity_v, v_opacity);
-    for (int l = 0; l < count; ++l) {
-      const std::size_t id = first + l;
-      if (radii[id] == 0) {  // its lanes may hold anything
-        std::fill_n(out.means + 3 * id, 3, 0.0f);
-        std::fill_n(out.quats + 4 * id, 4, 0.0f);
-        std::fill_n(out.scales + 3 * id, 3, 0.0f);
-        std::fill_n(out.means2d + 2 * id, 2, 0.0f);
-        out.opacities[id] = 0;
-        continue;
-      }
-      put<3>(out.means, id, v_means, l);
-      put<4>(out.quats, id, v_quats, l);
-      put<3>(out.scales, id, v_scales, l);
-      put<2>(out.means2d, id, v_means2d, l);
-      put<1>(out.opacities, id, v_opacity, l);
-    }
+    const FloatV v_opacity = received[4] / opacity, v_means2d[2] = {v.x, v.y};
+    scatter<3>(v_shape.mean, drawn, first, count, out.means);
+    scatter<4>(v_shape.quat, drawn, first, count, out.quats);
+    scatter<3>(v_shape.scale, drawn, first, count, out.scales);
+    scatter<2>(v_means2d, drawn, first, count, out.means2d);
+    scatter<1>(&v_opacity, drawn, first, count, out.opacities);
   }
 }
 

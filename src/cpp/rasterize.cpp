@@ -94,7 +94,7 @@ CAP4D_INLINE Outlines gather_outlines(const TileJob& job, std::size_t first, int
 }
 
 // Blocks that an outline meets, exact for their pixel centres' rows and columns: the widest chord of an ellipse within a band is at
-// its extreme point, or at the row of the band nearest to that. `note` takes (block, which of the kLanes Gaussians).
+// its extreme point, or at the row of the band nearest to that. `note` takes (block, which of the kLanes Gaussians meet it).
 template <class Note>
 CAP4D_INLINE void meet_blocks(const Outlines& s, int x0, int y0, const Note& note) {
   const FloatV zero = splat(0.0f), x = s.x - static_cast<float>(x0), y = s.y - static_cast<float>(y0);
@@ -109,29 +109,35 @@ CAP4D_INLINE void meet_blocks(const Outlines& s, int x0, int y0, const Note& not
     for (int column = 0; column < kBlockColumns; ++column) {
       const float centre = column * kBlockWidth + 0.5f;
       const MaskV met = less_equal_in(less_equal_in(crossed, first, splat(centre + (kBlockWidth - 1))), splat(centre), last);
-      note(column * kBands + band, bits(met));
+      note(column * kBands + band, met);
     }
   }
 }
 
-enum class Order { kByBlock, kByGaussian };
-
-// Meets Gaussians [begin, begin + count) of the tile with its blocks; fills one side of `meetings`.
-template <Order kOrder>
-void meet(const TileJob& job, std::size_t begin, int count, Meetings& meetings) {
-  if constexpr (kOrder == Order::kByBlock) std::memset(meetings.blocks, 0, sizeof meetings.blocks);
-  else std::memset(meetings.gaussians, 0, count * sizeof(BlockSet));
+// Meets Gaussians [begin, begin + count) of the tile with its blocks; fills in `blocks`.
+void meet_by_block(const TileJob& job, std::size_t begin, int count, Meetings& meetings) {
+  std::memset(meetings.blocks, 0, sizeof meetings.blocks);
   for (int first = 0; first < count; first += kLanes) {
     const int some = std::min(kLanes, count - first);
     const std::uint32_t real = (1u << some) - 1;
-    meet_blocks(gather_outlines(job, begin + first, some), job.x0, job.y0, [&](int block, std::uint32_t met) {
-      met &= real;
-      if constexpr (kOrder == Order::kByBlock) {
-        meetings.blocks[block][first / 64] |= std::uint64_t{met} << first % 64;
-      } else {
-        for (; met; met &= met - 1) meetings.gaussians[first + __builtin_ctz(met)] |= BlockSet{1} << block;
-      }
+    meet_blocks(gather_outlines(job, begin + first, some), job.x0, job.y0,
+                [&](int block, MaskV met) { meetings.blocks[block][first / 64] |= std::uint64_t{bits(met) & real} << first % 64; });
+  }
+}
+
+// The same; fills in `gaussians`.
+void meet_by_gaussian(const TileJob& job, std::size_t begin, int count, Meetings& meetings) {
+  constexpr int kWordsOf32 = (kBlocks + 31) / 32;
+  for (int first = 0; first < count; first += kLanes) {
+    IntV touched[kWordsOf32] = {};
+    meet_blocks(gather_outlines(job, begin + first, std::min(kLanes, count - first)), job.x0, job.y0, [&](int block, MaskV met) {
+      touched[block / 32] |= keep_int(met, static_cast<std::int32_t>(1u << block % 32));
     });
+    for (int l = 0; l < kLanes; ++l) {
+      BlockSet set = static_cast<std::uint32_t>(touched[0][l]);
+      if constexpr (kWordsOf32 == 2) set |= static_cast<BlockSet>(static_cast<std::uint32_t>(touched[kWordsOf32 - 1][l])) << 32;
+      meetings.gaussians[first + l] = set;
+    }
   }
 }
 
@@ -202,7 +208,7 @@ void draw_tile(const TileJob& job, BlockSums<kDepth>* sums) {
   for (int block = 0; block < kBlocks; ++block) sums[block] = BlockSums<kDepth>{}, sums[block].transmittance = transmittance[block];
   Meetings meetings;
   for (std::size_t begin = 0; begin < job.count && open; begin += kChunk) {
-    meet<Order::kByBlock>(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), meetings);
+    meet_by_block(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), meetings);
     for (BlockSet todo = open; todo; todo &= todo - 1) {
       const int block = __builtin_ctzll(todo);
       if (!draw_block<kDepth>(job, begin, meetings.blocks[block], block, sums[block])) open &= ~(BlockSet{1} << block);
@@ -343,7 +349,7 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
   BlockSet open = open_pixels(job, transmittance);
   Meetings meetings;
   for (std::size_t i = 0; i < job.count; ++i) {
-    if (i % kChunk == 0 && open) meet<Order::kByGaussian>(job, i, static_cast<int>(std::min<std::size_t>(kChunk, job.count - i)), meetings);
+    if (i % kChunk == 0 && open) meet_by_gaussian(job, i, static_cast<int>(std::min<std::size_t>(kChunk, job.count - i)), meetings);
     const Splat& s = job.splats[job.isects[i]];
     BlockSet todo = open ? open & meetings.gaussians[i % kChunk] : 0;
     FloatV v_red{}, v_green{}, v_blue{}, v_depth{}, v_s{}, v_sx{}, v_su{}, v_sxx{}, v_sxu{}, v_suu{};
@@ -358,7 +364,7 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
       const FloatV own = c.weight * value, behind = grads.behind[block] - own;
       // dL/d(ln alpha) = weight * value - alpha / (1 - alpha) * behind, where this one is drawn and not clamped.
       const MaskV moves = both(first_only(c.visible, c.stop), less(c.density, splat(kAlphaMax)));
-      const FloatV ds = keep(moves, own - behind * (c.alpha / (1.0f - c.alpha)));
+      const FloatV ds = keep(moves, own - behind * (c.alpha * reciprocal(1.0f - c.alpha)));
       v_red += c.weight * grads.red[block];
       v_green += c.weight * grads.green[block];
       v_blue += c.weight * grads.blue[block];
@@ -374,16 +380,15 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
       transmittance[block] = c.next;
       if (any(c.stop) && finished(c.next)) open &= ~(BlockSet{1} << block);
     }
-    SplatGrad& out = pair_grads[slots[i]];
+    // Straight into memory: read back in wider pieces it would wait for the stores.
+    float* out = &pair_grads[slots[i]].red;
     if (!touched) {
-      out = SplatGrad{};
+      pair_grads[slots[i]] = SplatGrad{};
       continue;
     }
-    float sums[12];
-    store4(sums, sums4(fold4(v_red), fold4(v_green), fold4(v_blue), fold4(v_depth)));
-    store4(sums + 4, sums4(fold4(v_s), fold4(v_sx), fold4(v_su), fold4(v_sxx)));
-    store4(sums + 8, sums4(fold4(v_sxu), fold4(v_suu), Float4{}, Float4{}));
-    std::memcpy(&out, sums, sizeof out);
+    store4(out, sums4(fold4(v_red), fold4(v_green), fold4(v_blue), fold4(v_depth)));
+    store4(out + 4, sums4(fold4(v_s), fold4(v_sx), fold4(v_su), fold4(v_sxx)));
+    store4(out + 8, sums4(fold4(v_sxu), fold4(v_suu), Float4{}, Float4{}));
   }
 }
 

@@ -4,6 +4,7 @@
 // The scalar overloads let the maths be written once for float, double and FloatV.
 #pragma once
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
@@ -152,32 +153,61 @@ CAP4D_INLINE FloatV load_half(const std::uint16_t* p) {
 #endif
 }
 
-// Turns 16 registers into rows of 16 floats (a row per lane): row l gets lane l of each. Only rows whose bit is set are written.
-CAP4D_INLINE void store_rows16(const FloatV* columns, float* rows, std::uint32_t which) {
+CAP4D_INLINE MaskV mask_of(std::uint32_t bits) {
 #ifdef CAP4D_AVX512
-  __m512 a[16], b[16];
-  for (int i = 0; i < 16; i += 4) {  // 4 x 4 within the 128-bit lanes
-    const __m512 lo0 = _mm512_unpacklo_ps(columns[i], columns[i + 1]), hi0 = _mm512_unpackhi_ps(columns[i], columns[i + 1]);
-    const __m512 lo1 = _mm512_unpacklo_ps(columns[i + 2], columns[i + 3]), hi1 = _mm512_unpackhi_ps(columns[i + 2], columns[i + 3]);
-    a[i] = _mm512_shuffle_ps(lo0, lo1, 0x44), a[i + 1] = _mm512_shuffle_ps(lo0, lo1, 0xee);
-    a[i + 2] = _mm512_shuffle_ps(hi0, hi1, 0x44), a[i + 3] = _mm512_shuffle_ps(hi0, hi1, 0xee);
-  }
+  return static_cast<MaskV>(bits);
+#else
+  IntV lane;
+  for (int i = 0; i < kLanes; ++i) lane[i] = static_cast<std::int32_t>(1u << i);
+  return (lane & static_cast<std::int32_t>(bits)) != 0;
+#endif
+}
+
+#ifdef __AVX2__
+#ifdef CAP4D_AVX512
+#define CAP4D_MM(name) _mm512_##name
+#else
+#define CAP4D_MM(name) _mm256_##name
+#endif
+CAP4D_INLINE void transpose4(const FloatV* in, FloatV* out) {  // 4 x 4 within the 128-bit lanes
+  const FloatV lo0 = CAP4D_MM(unpacklo_ps)(in[0], in[1]), hi0 = CAP4D_MM(unpackhi_ps)(in[0], in[1]);
+  const FloatV lo1 = CAP4D_MM(unpacklo_ps)(in[2], in[3]), hi1 = CAP4D_MM(unpackhi_ps)(in[2], in[3]);
+  out[0] = CAP4D_MM(shuffle_ps)(lo0, lo1, 0x44), out[1] = CAP4D_MM(shuffle_ps)(lo0, lo1, 0xee);
+  out[2] = CAP4D_MM(shuffle_ps)(hi0, hi1, 0x44), out[3] = CAP4D_MM(shuffle_ps)(hi0, hi1, 0xee);
+}
+#undef CAP4D_MM
+#endif
+
+// Turns 16 registers into rows of 16 floats, a row per lane, `stride` floats apart. Only rows whose bit is set are written.
+CAP4D_INLINE void store_rows16(const FloatV* columns, float* rows, std::size_t stride, std::uint32_t which) {
+#ifdef CAP4D_AVX512
+  FloatV a[16], b[16];
+  for (int i = 0; i < 16; i += 4) transpose4(columns + i, a + i);
   for (int j = 0; j < 4; ++j) {  // a[4 i + j] holds columns 4 i.. of rows j, 4 + j, 8 + j, 12 + j
     b[j] = _mm512_shuffle_f32x4(a[j], a[4 + j], 0x44), b[4 + j] = _mm512_shuffle_f32x4(a[j], a[4 + j], 0xee);
     b[8 + j] = _mm512_shuffle_f32x4(a[8 + j], a[12 + j], 0x44), b[12 + j] = _mm512_shuffle_f32x4(a[8 + j], a[12 + j], 0xee);
   }
   for (int j = 0; j < 4; ++j) {
-    const __m512 row[4] = {_mm512_shuffle_f32x4(b[j], b[8 + j], 0x88), _mm512_shuffle_f32x4(b[j], b[8 + j], 0xdd),
+    const FloatV row[4] = {_mm512_shuffle_f32x4(b[j], b[8 + j], 0x88), _mm512_shuffle_f32x4(b[j], b[8 + j], 0xdd),
                            _mm512_shuffle_f32x4(b[4 + j], b[12 + j], 0x88), _mm512_shuffle_f32x4(b[4 + j], b[12 + j], 0xdd)};
     for (int k = 0; k < 4; ++k)
-      if (which >> (4 * k + j) & 1) _mm512_storeu_ps(rows + 16 * (4 * k + j), row[k]);
+      if (which >> (4 * k + j) & 1) store(rows + stride * (4 * k + j), row[k]);
+  }
+#elif defined(__AVX2__)
+  for (int half = 0; half < 16; half += 8) {
+    FloatV a[8];
+    transpose4(columns + half, a), transpose4(columns + half + 4, a + 4);
+    for (int j = 0; j < 4; ++j) {  // a[j] holds columns 0-3 of rows j, 4 + j; a[4 + j] columns 4-7
+      if (which >> j & 1) store(rows + stride * j + half, _mm256_permute2f128_ps(a[j], a[4 + j], 0x20));
+      if (which >> (4 + j) & 1) store(rows + stride * (4 + j) + half, _mm256_permute2f128_ps(a[j], a[4 + j], 0x31));
+    }
   }
 #else
   float lanes[16][kLanes];
   for (int c = 0; c < 16; ++c) store(lanes[c], columns[c]);
   for (; which; which &= which - 1) {
     const int l = __builtin_ctz(which);
-    for (int c = 0; c < 16; ++c) rows[16 * l + c] = lanes[c][l];
+    for (int c = 0; c < 16; ++c) rows[stride * l + c] = lanes[c][l];
   }
 #endif
 }
@@ -185,26 +215,39 @@ CAP4D_INLINE void store_rows16(const FloatV* columns, float* rows, std::uint32_t
 // The first 8 floats of kLanes rows as 8 registers.
 CAP4D_INLINE void load_rows8(const float* const* rows, FloatV* columns) {
 #ifdef CAP4D_AVX512
-  __m512 z[8], t[8];
+  FloatV z[8], t[8];
   for (int i = 0; i < 8; ++i) {  // rows i and i + 4 of each half of the rows
     const int row = i < 4 ? i : i + 4;
     z[i] = _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(rows[row])), _mm256_loadu_ps(rows[row + 4]), 1);
   }
-  for (int i = 0; i < 8; i += 4) {
-    const __m512 lo0 = _mm512_unpacklo_ps(z[i], z[i + 1]), hi0 = _mm512_unpackhi_ps(z[i], z[i + 1]);
-    const __m512 lo1 = _mm512_unpacklo_ps(z[i + 2], z[i + 3]), hi1 = _mm512_unpackhi_ps(z[i + 2], z[i + 3]);
-    t[i] = _mm512_shuffle_ps(lo0, lo1, 0x44), t[i + 1] = _mm512_shuffle_ps(lo0, lo1, 0xee);
-    t[i + 2] = _mm512_shuffle_ps(hi0, hi1, 0x44), t[i + 3] = _mm512_shuffle_ps(hi0, hi1, 0xee);
-  }
+  transpose4(z, t), transpose4(z + 4, t + 4);
   for (int c = 0; c < 4; ++c) {
     columns[c] = _mm512_shuffle_f32x4(t[c], t[4 + c], 0x88);
     columns[4 + c] = _mm512_shuffle_f32x4(t[c], t[4 + c], 0xdd);
+  }
+#elif defined(__AVX2__)
+  FloatV z[8], t[8];
+  for (int l = 0; l < 8; ++l) z[l] = load(rows[l]);
+  transpose4(z, t), transpose4(z + 4, t + 4);
+  for (int c = 0; c < 4; ++c) {
+    columns[c] = _mm256_permute2f128_ps(t[c], t[4 + c], 0x20);
+    columns[4 + c] = _mm256_permute2f128_ps(t[c], t[4 + c], 0x31);
   }
 #else
   float lanes[8][kLanes];
   for (int l = 0; l < kLanes; ++l)
     for (int c = 0; c < 8; ++c) lanes[c][l] = rows[l][c];
   for (int c = 0; c < 8; ++c) columns[c] = load(lanes[c]);
+#endif
+}
+
+// About 1 / x for normal x, relative error below 3e-7.
+CAP4D_INLINE FloatV reciprocal(FloatV x) {
+#ifdef CAP4D_AVX512
+  const FloatV r = _mm512_rcp14_ps(x);
+  return r * (2.0f - x * r);
+#else
+  return 1.0f / x;
 #endif
 }
 
