@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from cap4d.evaluate.bench import sections
 from cap4d.evaluate.bench.ceilings import ANCHORS
 from cap4d.evaluate.bench.fitting import FUSED, OURS
 from cap4d.evaluate.bench.plot_avatars import pareto
@@ -123,6 +124,27 @@ def test_an_optimised_avatar_must_be_smaller_and_faster(
     rows = [{"name": name, "psnr_db": 45.5} for name in ("full", "small")]
     found = {"avatar": "me.cap4d", "limit_db": 45, "smaller": smaller, "faster": faster, "rows": rows}
     assert verdicts(shrinking_shows(found)) == [expected]
+
+
+def test_an_optimised_avatar_has_its_tables() -> None:
+    row = {
+        "bytes": 4_000_000,
+        "tier": "int8",
+        "gaussians": 900,
+        "median_ms": 7.0,
+        "p95_ms": 9.0,
+        "psnr_db": 45.2,
+    }
+    found = {
+        "avatar": "me.cap4d",
+        "limit_db": 45.0,
+        "rows": [{"name": "full", **row}],
+        "steps": [{"name": "prune", "bytes": 4_000_000, "psnr_db": 45.2}],
+    }
+    page = list(sections.optimize(found))
+    assert page[0] == "## `cap4d optimize` of me.cap4d at 45 dB"
+    assert "| full | 4,000,000 | int8 | 900 | 7 | 9 | 45.2 |" in page
+    assert "| prune | 4,000,000 | 45.2 |" in page
 
 
 def test_a_verdict_counts_what_can_be_judged() -> None:
