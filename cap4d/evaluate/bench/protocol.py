@@ -19,7 +19,8 @@ STEPS = (
     "Memory of a call is what a fresh process holds at its peak during it, less what it held before; "
     "memory of frames is the peak of a process that loads the avatar and plays.",
     "A frame is the time from one picture to the next in the loop that renders videos: clip, head rig, "
-    "deformer, binding, sorting, splatting, 8 bits on white. The idle clip plays, the camera stands still. "
+    "deformer, binding, sorting, splatting, 8 bits on white. The idle clip plays, the camera stands "
+    "still. Pipelined, the next face is worked out while a frame is drawn, on half of the threads each. "
     "Tiers take turns in blocks of 25 frames, of which the first 2 do not count.",
     "A frame's PSNR is of its 8-bit pixels against the most exact tier's Gaussians drawn in float64, the "
     "squared error pooled over the compared frames; the rounding to 8 bits alone leaves 59 dB.",
