@@ -18,6 +18,7 @@ from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.evaluate.bench.accuracy import picture_error
 from cap4d.evaluate.bench.child import ChildError, in_child
+from cap4d.evaluate.bench.memory import peak_mb
 from cap4d.evaluate.bench.settings import Settings
 from cap4d.evaluate.bench.tiers import clip_frames, load_tiers
 from cap4d.evaluate.bench.tiled import render_tiled
@@ -26,7 +27,6 @@ from cap4d.evaluate.image import mse, pooled_psnr
 from cap4d.gaussians import SH_COUNTS, Gaussians
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import WHITE, draw_on_cpu, render_clip
-from cap4d.player.stages import peak_memory_mb
 
 log = logging.getLogger(__name__)
 
@@ -177,10 +177,10 @@ def memory_alone(*, path: str, tier: str, pipelined: bool, threads: int, frames:
     player = way.play(way.avatar.camera.resized(SIDE, SIDE))
     for _ in range(5):
         next(player)
-    early = peak_memory_mb()
+    early = peak_mb()
     for _ in range(frames):
         next(player)
-    return {"memory_mb": round(peak_memory_mb(), 1), "memory_grown_mb": round(peak_memory_mb() - early, 1)}
+    return {"memory_mb": round(peak_mb(), 1), "memory_grown_mb": round(peak_mb() - early, 1)}
 
 
 def _memory(path: Path, way: Way, settings: Settings) -> dict[str, float]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 STEPS = (
     "Views are fixed: view 0 of the scene's cameras, the avatar's own camera at 512 x 512.",
     "Reading files, building scenes, the first frame and writing pictures are outside every time.",
-    "Every call is warmed up (2 runs); then all calls of a table take turns, one run each, so that "
-    "whatever else the machine does hits all alike. Times are wall clock, median and 95th percentile over "
-    "all runs (for frames the 99th too); Python's garbage collector rests meanwhile. Where other packages "
-    "take part there is a pause before each run, for their threads spin on for a while.",
+    "All calls of a table take turns, five runs of one call each, in another order every round, so that "
+    "whatever else the machine does hits all alike. The first run of a turn warms up and does not count. "
+    "Times are wall clock, median and 95th percentile over all runs (for frames the 99th too); Python's "
+    "garbage collector rests meanwhile. Where other packages take part there is a pause before each turn, "
+    "for their threads spin on.",
     "Ceilings are the best of many goes in the same run. A floor is the counted work of a scene at these "
     "ceilings, stage after stage. Targets in milliseconds were set at the anchors' ceilings; they are "
     "scaled by the ratio of the floors.",
