@@ -95,7 +95,9 @@ def test_the_avatar_is_measured_in_each_of_its_tiers(report: Path) -> None:
     assert errors["full"] == {"rms_mm": 0, "max_mm": 0} and errors["off"]["rms_mm"] > 0
     assert [row["pass"] is None for row in deformer["tiers"]] == [False] * (len(tiers) - 1) + [True]
     assert len(deformer["plain"]) == 2
-    rows = {row["tier"]: row for row in frame["tiers"]}
+    rows = {row["name"]: row for row in frame["tiers"]}
+    assert list(rows)[:2] == ["full", "full, pipelined"] and "off, pipelined" not in rows
+    assert rows["full"]["psnr_db"] == rows["full, pipelined"]["psnr_db"]
     assert rows["full"]["psnr_db"] > 50 > rows["off"]["psnr_db"] > 10
     assert rows["full"]["memory_mb"] > 20 and rows["full"]["stages"]["frame"]["median_ms"] > 0
     plans = {(c["tier"], c["sh_degree"], c["side"]) for c in frame["configurations"]}

@@ -17,14 +17,15 @@ def test_percentiles_are_of_all_runs_in_milliseconds() -> None:
     assert found == pytest.approx(expected)
 
 
-def test_calls_take_turns_and_warming_up_does_not_count() -> None:
+def test_calls_take_turns_and_the_first_of_a_turn_does_not_count() -> None:
     done: list[str] = []
     now = iter(range(100))
     calls = {name: (lambda name=name: done.append(name)) for name in "ab"}
-    timings = measure(calls, runs=3, warm_up=1, clock=lambda: float(next(now)))
-    assert done[:2] == ["a", "b"]
-    assert all(sorted(done[i : i + 2]) == ["a", "b"] for i in range(2, 8, 2)) and len(done) == 8
-    assert timings["a"].seconds == timings["b"].seconds == (1.0, 1.0, 1.0)
+    timings = measure(calls, runs=6, clock=lambda: float(next(now)))
+    assert timings["a"].seconds == timings["b"].seconds == (1.0,) * 6
+    turns = [done[:5], done[5:10], done[10:13], done[13:]]
+    assert all(len(set(turn)) == 1 for turn in turns) and len(done) == 16
+    assert {turns[0][0], turns[1][0]} == {turns[2][0], turns[3][0]} == {"a", "b"}
 
 
 def test_frames_take_turns_in_blocks() -> None:

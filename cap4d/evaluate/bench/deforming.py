@@ -19,7 +19,7 @@ from cap4d.player.avatar import Avatar
 
 log = logging.getLogger(__name__)
 
-REST_S = 0.02  # plain onnxruntime's threads spin for a while after a pass
+REST_S = 0.05  # plain onnxruntime's threads spin for a while after a pass
 EXPRESSIONS = 24  # frames that times and errors are taken over
 PLAIN, RESTING = "onnxruntime, as it comes", "onnxruntime, threads that do not spin"
 

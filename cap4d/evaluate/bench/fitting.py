@@ -17,7 +17,7 @@ from cap4d.evaluate.bench.timing import measure
 GAUSSIANS = 100_000
 SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (16, 3)}
 RATE, BETAS, EPSILON = 1e-3, (0.9, 0.999), 1e-8
-REST_S = 0.02  # torch's threads spin for a while after their work
+REST_S = 0.05  # torch's threads spin for a while after their work
 STEPS = 10  # after which the parameters are compared
 TORCH, FUSED, OURS = "torch.optim.Adam", "torch.optim.Adam(fused=True)", "cap4d, fused"
 

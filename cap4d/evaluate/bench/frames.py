@@ -8,7 +8,7 @@ import copy
 import logging
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.evaluate.bench.accuracy import picture_error
 from cap4d.evaluate.bench.child import ChildError, in_child
+from cap4d.evaluate.bench.memory import peak_mb
 from cap4d.evaluate.bench.settings import Settings
 from cap4d.evaluate.bench.tiers import clip_frames, load_tiers
 from cap4d.evaluate.bench.tiled import render_tiled
@@ -26,7 +27,6 @@ from cap4d.evaluate.image import mse, pooled_psnr
 from cap4d.gaussians import SH_COUNTS, Gaussians
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import WHITE, draw_on_cpu, render_clip
-from cap4d.player.stages import peak_memory_mb
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +36,26 @@ BLOCK = 25  # frames of one tier in a row, before the next tier's turn
 WARM_UP = 2  # frames of each block that do not count
 
 
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A tier, and whether the next frame's face is worked out while a frame is drawn."""
+
+    tier: str
+    avatar: Avatar
+    pipelined: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.tier}, pipelined" if self.pipelined else self.tier
+
+    def play(self, camera: Camera) -> Iterator[np.ndarray]:
+        """The idle clip for ever, through the same loop that writes videos."""
+        avatar = self.avatar
+        return render_clip(avatar, avatar.idle, lambda *_: camera, frames=1 << 30, pipelined=self.pipelined)
+
+
 def measure_frames(path: Path, settings: Settings) -> dict[str, Any]:
-    """One avatar: a row per tier, and the configurations of the Pareto plot."""
+    """One avatar: a row per tier, pipelined and not, and the configurations of the Pareto plot."""
     log.info("frame: %s", path)
     tiers = load_tiers(path, threads=settings.threads)
     first = next(iter(tiers.values()))
@@ -45,24 +63,10 @@ def measure_frames(path: Path, settings: Settings) -> dict[str, Any]:
     log.info("frame: %s: the truth in float64", path)
     samples = clip_frames(first.bundle, settings.samples)
     truths = [true_picture(pose_of(first, frame), camera) for frame in samples]
-    for avatar in tiers.values():
-        avatar.stages.clear()
-    seconds = time_blocks({tier: playing(avatar, camera) for tier, avatar in tiers.items()}, settings.frames)
-    rows = []
-    for tier, avatar in tiers.items():
-        timing = Timing(tuple(seconds[tier]))
-        rows.append(
-            {
-                "tier": tier,
-                "name": tier,
-                "fps": round(len(timing.seconds) / sum(timing.seconds), 2),
-                **timing.report(),
-                "p99_over_median": round(timing.report()["p99_ms"] / timing.median_ms, 3),
-                "stages": avatar.stages.report(),
-                **pixel_error(avatar, samples, truths, camera),
-                **_memory(path, tier, settings),
-            }
-        )
+    ways = find_ways(path, tiers, settings)
+    for way in ways:
+        way.avatar.stages.clear()
+    seconds = time_blocks({way.name: way.play(camera) for way in ways}, settings.frames)
     return {
         "avatar": path.name,
         "gaussians": len(first.bundle),
@@ -70,8 +74,40 @@ def measure_frames(path: Path, settings: Settings) -> dict[str, Any]:
         "side": SIDE,
         "truth": next(iter(tiers)),
         "samples": len(samples),
-        "tiers": rows,
+        "tiers": [
+            {
+                **_times(way, Timing(tuple(seconds[way.name]))),
+                **pixel_error(way.avatar, samples, truths, camera),
+                **_memory(path, way, settings),
+            }
+            for way in ways
+        ],
         "configurations": _configurations(tiers, samples, truths, camera, settings),
+    }
+
+
+def find_ways(path: Path, tiers: dict[str, Avatar], settings: Settings) -> list[Way]:
+    """Every tier, and those with a network pipelined too, on half of the threads for each of the two
+    halves.
+    """
+    half = load_tiers(path, threads=max(1, settings.threads // 2))
+    ways = []
+    for tier, avatar in tiers.items():
+        ways.append(Way(tier, avatar))
+        if avatar.deformer is not None:
+            ways.append(Way(tier, half[tier], pipelined=True))
+    return ways
+
+
+def _times(way: Way, timing: Timing) -> dict[str, Any]:
+    found = timing.report()
+    return {
+        "tier": way.tier,
+        "name": way.name,
+        "fps": round(len(timing.seconds) / sum(timing.seconds), 2),
+        **found,
+        "p99_over_median": round(found["p99_ms"] / timing.median_ms, 3),
+        "stages": way.avatar.stages.report(),
     }
 
 
@@ -133,32 +169,26 @@ def time_blocks(players: dict[str, Iterator[np.ndarray]], frames: int) -> dict[s
     return seconds
 
 
-def memory_alone(*, path: str, tier: str, threads: int, frames: int) -> dict[str, float]:
+def memory_alone(*, path: str, tier: str, pipelined: bool, threads: int, frames: int) -> dict[str, float]:
     """A process that does nothing else than play: its memory at its peak after a few and after all frames,
     MB.
     """
-    avatar = Avatar.load(path, deformer=tier, threads=threads)
-    player = playing(avatar, avatar.camera.resized(SIDE, SIDE))
+    way = Way(tier, Avatar.load(path, deformer=tier, threads=threads), pipelined)
+    player = way.play(way.avatar.camera.resized(SIDE, SIDE))
     for _ in range(5):
         next(player)
-    early = peak_memory_mb()
+    early = peak_mb()
     for _ in range(frames):
         next(player)
-    return {"memory_mb": round(peak_memory_mb(), 1), "memory_grown_mb": round(peak_memory_mb() - early, 1)}
+    return {"memory_mb": round(peak_mb(), 1), "memory_grown_mb": round(peak_mb() - early, 1)}
 
 
-def playing(avatar: Avatar, camera: Camera) -> Iterator[np.ndarray]:
-    """The idle clip for ever, through the same loop that writes videos."""
-    return render_clip(avatar, avatar.idle, lambda index, frame: camera, frames=1 << 30)
-
-
-def _memory(path: Path, tier: str, settings: Settings) -> dict[str, float]:
+def _memory(path: Path, way: Way, settings: Settings) -> dict[str, float]:
+    arguments = {"path": str(path), "tier": way.tier, "pipelined": way.pipelined}
     try:
-        return in_child(
-            "frame", path=str(path), tier=tier, threads=settings.threads, frames=settings.short_runs
-        )
+        return in_child("frame", **arguments, threads=way.avatar.threads, frames=settings.short_runs)
     except ChildError as error:
-        log.warning("frame: %s in a process of its own: %s", tier, error)
+        log.warning("frame: %s in a process of its own: %s", way.name, error)
         return {}
 
 
@@ -177,7 +207,7 @@ def _configurations(
     avatars = {plan: _with_sh_degree(tiers[plan[0]], plan[1]) for plan in plans}
     views = {plan: camera.resized(plan[2], plan[2]) for plan in plans}
     seconds = time_blocks(
-        {str(plan): playing(avatars[plan], views[plan]) for plan in plans}, settings.short_runs
+        {str(plan): Way(plan[0], avatars[plan]).play(views[plan]) for plan in plans}, settings.short_runs
     )
     return [
         {

@@ -24,6 +24,14 @@ def memory_of(call: Callable[[], object]) -> float:
     return max(0.0, (_status_mb("VmHWM") or before) - before)
 
 
+def peak_mb() -> float:
+    """The most that this process has held, MB.
+
+    On Linux not what `getrusage` says: that begins with what the process that started this one held.
+    """
+    return (_status_mb("VmHWM") if STATUS.is_file() else None) or peak_memory_mb()
+
+
 def _resident_mb() -> float | None:
     """What is held now, with the peak set back to it; None where the system does not do that."""
     try:

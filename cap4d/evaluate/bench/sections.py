@@ -165,7 +165,16 @@ def _tier(row: Report, avatar: Report) -> tuple[object, ...]:
 
 def frame(avatars: list[Report]) -> Iterator[str]:
     yield from ("## Whole frames", "")
-    columns = ("fps", "median_ms", "p95_ms", "p99_ms", "p99_over_median", "psnr_db", "memory_mb")
+    columns = (
+        "fps",
+        "median_ms",
+        "p95_ms",
+        "p99_ms",
+        "p99_over_median",
+        "psnr_db",
+        "memory_mb",
+        "memory_grown_mb",
+    )
     for avatar in avatars:
         side = avatar["side"]
         yield from (f"### {avatar['avatar']}", "")
@@ -173,7 +182,17 @@ def frame(avatars: list[Report]) -> Iterator[str]:
         yield f"pictures against `{avatar['truth']}` drawn in float64, {avatar['samples']} frames."
         yield ""
         yield from table(
-            ("tier", "fps", "median", "p95", "p99", "p99 / median", "PSNR, dB", "memory, MB"),
+            (
+                "tier",
+                "fps",
+                "median",
+                "p95",
+                "p99",
+                "p99 / median",
+                "PSNR, dB",
+                "memory, MB",
+                "grown since frame 5",
+            ),
             ((row["name"], *(row.get(name) for name in columns)) for row in avatar["tiers"]),
         )
         stages = list(dict.fromkeys(stage for row in avatar["tiers"] for stage in row["stages"]))

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cap4d.evaluate.bench.frames import SIDE, pixel_error, playing, pose_of, time_blocks, true_picture
+from cap4d.evaluate.bench.frames import SIDE, Way, pixel_error, pose_of, time_blocks, true_picture
 from cap4d.evaluate.bench.settings import Settings
 from cap4d.evaluate.bench.tiers import TIERS, clip_frames
 from cap4d.evaluate.bench.timing import Timing
@@ -37,7 +37,7 @@ def measure_shrinking(path: Path, settings: Settings) -> dict[str, Any]:
     camera = avatars["full"].camera.resized(SIDE, SIDE)
     samples = clip_frames(avatars["full"].bundle, settings.samples)
     truths = [true_picture(pose_of(avatars["full"], frame), camera) for frame in samples]
-    players = {name: playing(avatar, camera) for name, avatar in avatars.items()}
+    players = {name: Way(avatar.tier, avatar).play(camera) for name, avatar in avatars.items()}
     times = {name: Timing(tuple(s)) for name, s in time_blocks(players, settings.frames).items()}
     return {
         "avatar": path.name,

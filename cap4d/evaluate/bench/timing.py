@@ -36,40 +36,41 @@ def percentile_ms(seconds: tuple[float, ...], percent: float) -> float:
     return float(np.percentile(np.asarray(seconds) * 1e3, percent))
 
 
+TURN = 5  # calls in a row, before the next one's turn; the first does not count
+
+
 def measure(
     calls: Mapping[str, Callable[[], object]],
     *,
     runs: int,
-    warm_up: int = 2,
     rest_s: float = 0.0,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, Timing]:
-    """Times several calls, one run of each in turn, so that whatever else the machine does hits all alike.
+    """Times several calls in turns, so that whatever else the machine does hits all alike.
 
-    Each round has an order of its own: what a call leaves in the caches helps or hurts all others alike.
+    A turn is `TURN` runs of one call. The first of them finds the caches as another call left them, which is
+    not what a player or a fit sees, and does not count. Each round of turns has an order of its own.
 
     Args:
         calls: By name.
         runs: Of each call that count.
-        warm_up: Runs of each call before that.
-        rest_s: Pause before each run.
+        rest_s: Pause before each turn.
         clock: Seconds.
     """
-    for call in calls.values():
-        for _ in range(warm_up):
-            call()
-    shuffle, names = np.random.default_rng(0), list(calls)
     seconds: dict[str, list[float]] = {name: [] for name in calls}
+    shuffle, names = np.random.default_rng(0), list(calls)
     was_enabled = gc.isenabled()
     gc.disable()
     try:
-        for _ in range(runs):
-            for name in shuffle.permutation(names):
-                call = calls[name]
+        while any(len(times) < runs for times in seconds.values()):
+            for place in shuffle.permutation(len(names)):
+                call, times = calls[names[place]], seconds[names[place]]
                 time.sleep(rest_s)
-                start = clock()
                 call()
-                seconds[name].append(clock() - start)
+                for _ in range(min(TURN - 1, runs - len(times))):
+                    start = clock()
+                    call()
+                    times.append(clock() - start)
     finally:
         if was_enabled:
             gc.enable()
