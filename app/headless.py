@@ -13,8 +13,8 @@ from cap4d.app.options import Options
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.drive.source import open_source
-from cap4d.player.avatar import Avatar
 from cap4d.errors import ArgumentError
+from cap4d.player.avatar import Avatar
 from cap4d.player.offline import Draw, Output, draw_on_cpu, pipeline_threads, render_to
 
 log = logging.getLogger(__name__)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cap4d.app.splat_pass import render_constants
 from gl_scenes import NO_DRIVER, SCENES, avatar_views, scene
 from tiny_bundle import tiny_bundle
 
-from cap4d.app.splat_pass import render_constants
 from cap4d.player.avatar import Avatar
 
 DRIVERS = {

@@ -1,7 +1,6 @@
 """Mouse and keyboard, without a window."""
 
 import pytest
-
 from cap4d.app.controls import Controls, Drag
 from cap4d.app.orbit import Orbit
 from cap4d.app.play_clock import PlayClock

@@ -9,14 +9,14 @@ from pathlib import Path
 import glfw
 import numpy as np
 import pytest
-from tiny_bundle import tiny_bundle
-
 from cap4d.app.controls import Controls, Drag
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.live import LivePlayer, ReadOut, choose_renderer
 from cap4d.app.play_clock import PlayClock
 from cap4d.app.renderers import CpuRenderer, GlRenderer
 from cap4d.app.window import DisplayUnavailableError, Window, _key, _press
+from tiny_bundle import tiny_bundle
+
 from cap4d.bundle import write_bundle
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import camera_path

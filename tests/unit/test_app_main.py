@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from tiny_bundle import tiny_bundle
-
-from cap4d import cli
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.headless import choose_backend
 from cap4d.app.main import main
+from tiny_bundle import tiny_bundle
+
+from cap4d import cli
 from cap4d.bundle import write_bundle
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar

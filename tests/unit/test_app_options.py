@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-
 from cap4d.app.options import parse_options
 
 

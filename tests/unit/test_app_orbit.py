@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from cap4d.app.orbit import DISTANCE_RANGE, MAX_PITCH_DEG, Orbit
+
 from cap4d.camera import orbit_camera
 
 VIEW = Orbit(yaw_deg=20, pitch_deg=10, distance=0.8, target=(0.01, -0.02, 0.03), fov_deg=24)

@@ -1,7 +1,6 @@
 """The clip on the wall clock."""
 
 import pytest
-
 from cap4d.app.play_clock import PlayClock
 
 

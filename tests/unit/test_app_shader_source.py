@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.shader_source import ShaderError, build_program, read_package_shader, shader_source
 
