@@ -42,7 +42,7 @@ HARD = {
     "enormous": (2e-6, 1.5e-5, 1.5e-4),
     "colossal": (1e-6, 3e-5, 1e-4),  # near 1 / sigma^2 = 1e-19, where float32 has begun to lose digits
     "every_scale": (1.5e-6, 8e-6, 1.5e-4),
-    "covering": (2e-7, 1.2e-6, 4e-6),
+    "covering": (2e-7, 1.2e-6, 3.5e-6),
     "layers": (5e-6, 3e-6, 1.5e-4),
     "saturated": (1e-4, 9e-5, 9e-4),  # log2 of an opacity of 1e38 leaves 17 bits for where it falls to 1/255
     "opaque": (1.2e-6, 4e-6, 1.8e-4),
@@ -55,12 +55,11 @@ HARD = {
     "fov_170": (5e-6, 4e-6, 1.2e-4),
     "off_centre": (4e-5, 9e-5, 3e-3),  # positions are differences of numbers near 1000 px
     "one_pixel": (4e-7, 8e-5, 3e-3),  # one pixel's terms: what lies in front cancels behind it
-    "wide_8192": (5e-6, 4e-6, 6e-5),
-    "high_8192": (7e-6, 8e-6, 1.3e-4),
+    "wide_8192": (2.5e-6, 5e-6, 1.5e-4),
+    "high_8192": (3.5e-6, 5e-6, 1.4e-4),
 }
 HARD_FLIP_SHARE = 0.05  # "layers": with a thousand of them, 3 % of the pixels have some alpha near a cut-off
 HARD_MEANS2D = 2e-7  # relative, where that is more than MEANS2D: 24 bits, far outside the image as well
-HARD_DEPTH_STEP = 3e-7  # m, by which neighbours in depth may swap 10 km from the origin: of a depth of 1 m
 
 # Binding to slivers, inverted, tiny and huge triangles, each row relative to its own norm.
 HARD_BIND = 7e-7  # one rounding of the frame, one or two of the product: frames are computed in double
