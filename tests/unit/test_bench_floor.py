@@ -35,7 +35,9 @@ def test_each_stage_stands_at_its_own_roof() -> None:
     assert stages["bin"].ms == pytest.approx(0.174421)
     assert stages["blend"].flops == 7_055_504 * 34
     assert stages["blend"].ms == pytest.approx(7_055_504 * 34 / 100e9 * 1e3)
-    assert stages["write"].ms == pytest.approx(262_144 * 16 / 10e9 * 1e3)
+    assert stages["write"].ms == pytest.approx(262_144 * 20 / 10e9 * 1e3)  # rgb, alpha and depth
+    eye = {stage.name: stage for stage in forward_floor(HEAD_100K, ROUND, lanes=16, prepared=True)}
+    assert eye["write"].bytes == 262_144 * 4 and eye["blend"].flops == 7_055_504 * 31
 
 
 def test_a_stage_is_bound_by_the_slower_of_its_arithmetic_and_its_bytes() -> None:
@@ -45,7 +47,7 @@ def test_a_stage_is_bound_by_the_slower_of_its_arithmetic_and_its_bytes() -> Non
 
 
 def test_half_precision_colours_are_half_the_bytes() -> None:
-    whole, half = (forward_floor(HEAD_100K, ROUND, lanes=16, half_sh=h)[0].bytes for h in (False, True))
+    whole, half = (forward_floor(HEAD_100K, ROUND, lanes=16, prepared=h)[0].bytes for h in (False, True))
     assert whole - half == 100_000 * 48 * 2
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from tiny_bundle import tiny_bundle
 
-from cap4d import _core, cli
+from cap4d import cli
 from cap4d.bundle import write_bundle
 from cap4d.errors import ArgumentError
 from cap4d.evaluate.bench import peers
 from cap4d.evaluate.bench.child import ChildError, in_child
-from cap4d.evaluate.bench.fitting import FUSED, OURS, TORCH
+from cap4d.evaluate.bench.fitting import FUSED, TORCH
 from cap4d.evaluate.bench.plots import draw_plots
 from cap4d.evaluate.bench.run import parse_sections, try_plots
 from cap4d.evaluate.bench.scenes import SceneSource
@@ -81,8 +81,7 @@ def test_the_numbers_of_the_splatter_hang_together(report: Path) -> None:
 def test_all_steps_of_adam_are_the_same(report: Path) -> None:
     fit = json.loads((report / "out" / "report.json").read_text())["fit"]
     assert fit["values"] == 1_000 * 59
-    ours = [OURS] if hasattr(_core, "adam_step") else []
-    assert [step["name"] for step in fit["steps"]] == [*ours, TORCH, FUSED]
+    assert [step["name"] for step in fit["steps"]] == [TORCH, FUSED]
     assert all(step["difference"] < 1e-6 for step in fit["steps"])
 
 

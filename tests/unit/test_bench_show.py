@@ -8,7 +8,7 @@ import pytest
 
 from cap4d.evaluate.bench import sections
 from cap4d.evaluate.bench.ceilings import ANCHORS
-from cap4d.evaluate.bench.fitting import FUSED, OURS
+from cap4d.evaluate.bench.fitting import FUSED, TORCH
 from cap4d.evaluate.bench.plot_avatars import pareto
 from cap4d.evaluate.bench.show import (
     Show,
@@ -71,7 +71,7 @@ def test_time_may_grow_as_the_blended_pairs_do_and_no_faster() -> None:
 
 
 def test_the_fused_step_is_held_against_the_other_one() -> None:
-    steps = [{"name": FUSED, "median_ms": 3.0}, {"name": OURS, "median_ms": 2.0}]
+    steps = [{"name": TORCH, "median_ms": 3.0}, {"name": FUSED, "median_ms": 2.0}]
     fit = {"gaussians": 100, "floor_ms": 1.0, "steps": steps}
     assert verdicts(fitting_shows(fit)) == [True]
     assert list(fitting_shows({**fit, "steps": steps[:1]})) == []

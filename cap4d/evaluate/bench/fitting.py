@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from cap4d import _core
 from cap4d.evaluate.bench.ceilings import Ceilings
 from cap4d.evaluate.bench.floor import adam_floor_ms
 from cap4d.evaluate.bench.settings import Settings
@@ -19,7 +18,7 @@ SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (
 RATE, BETAS, EPSILON = 1e-3, (0.9, 0.999), 1e-8
 REST_S = 0.05  # torch's threads spin for a while after their work
 STEPS = 10  # after which the parameters are compared
-TORCH, FUSED, OURS = "torch.optim.Adam", "torch.optim.Adam(fused=True)", "cap4d, fused"
+TORCH, FUSED = "torch.optim.Adam", "torch.optim.Adam(fused=True)"
 
 Fields = dict[str, np.ndarray]
 Step = Callable[[], Any]
@@ -30,10 +29,6 @@ def measure_fitting(settings: Settings, ceilings: Ceilings) -> dict[str, Any]:
     count = GAUSSIANS // 100 if settings.quick else GAUSSIANS
     values = count * sum(int(np.prod(shape)) for shape in SHAPES.values())
     steps, missing = {}, []
-    if hasattr(_core, "adam_step"):
-        steps[OURS] = our_step
-    else:
-        missing.append("our fused Adam: this build of _core has none")
     try:
         importlib.import_module("torch")
         steps |= {TORCH: torch_step, FUSED: fused_step}
@@ -71,21 +66,6 @@ def after_steps(calls: dict[str, Step], parameters: dict[str, Fields]) -> dict[s
     }
 
 
-def our_step(parameters: Fields, gradients: Fields, *, threads: int) -> Step:
-    """Ours, as `avatar.adam` calls it."""
-    moments = {name: [np.zeros_like(field) for _ in range(2)] for name, field in parameters.items()}
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        for name, field in parameters.items():
-            how = (RATE, *BETAS, EPSILON, 0.0, done, threads)
-            _core.adam_step(field, gradients[name], *moments[name], *how)
-
-    return step
-
-
 def torch_step(parameters: Fields, gradients: Fields, *, threads: int, **options: bool) -> Step:
     """torch's, the kind that one gets without asking. It writes to the arrays themselves."""
     torch = importlib.import_module("torch")
@@ -97,7 +77,7 @@ def torch_step(parameters: Fields, gradients: Fields, *, threads: int, **options
 
 
 def fused_step(parameters: Fields, gradients: Fields, *, threads: int) -> Step:
-    """torch's fused one."""
+    """torch's fused one, which the fit takes."""
     return torch_step(parameters, gradients, threads=threads, fused=True)
 
 

@@ -18,7 +18,7 @@ from cap4d.evaluate.bench.work import Work
 # Evaluate: offsets 2, shear 2, exponent 6, exp2 13 (3 and a polynomial of degree 5), weight 1, transmittance
 # 1.
 EVALUATE_FLOPS = 25
-ACCUMULATE_FLOPS = 9  # three colours 6, alpha 1, depth 2
+ACCUMULATE_FLOPS, PLAY_FLOPS = 9, 6  # three colours 6, alpha 1, depth 2; for the eye the colours alone
 GRADIENT_FLOPS = 29  # value 6, own share and what is behind 2, d ln(alpha) 4, colours 6, moments 11
 # Operations per drawn Gaussian in src/cpp/project.h and sh.h, SH aside.
 PROJECT_FLOPS = 230
@@ -27,7 +27,7 @@ SH_FLOPS, SH_VJP_FLOPS = 8, 16  # per coefficient of all three channels: the sum
 
 FLOAT = 4  # bytes
 GEOMETRY_FLOATS = 11  # mean 3, quaternion 4, scale 3, opacity 1
-PLAY_FLOATS, TRAIN_FLOATS = 4, 5  # a pixel's rgb and alpha; and depth
+PLAY_BYTES, TRAIN_FLOATS = 4, 5  # a pixel for the eye: rgb and alpha in 8 bits; rgb, alpha and depth
 SPLAT_FLOATS = 11  # of a pair: position 2, shape 3, opacity 1, colour 3, depth 1, and the index that finds it
 SPLAT_GRAD_FLOATS = 10  # what one Gaussian receives in one tile
 MEANS2D_FLOATS = 2  # the gradient that densification reads
@@ -47,23 +47,24 @@ class Stage:
         return {**asdict(self), "ms": round(self.ms, 4)}
 
 
-def forward_floor(work: Work, ceilings: Ceilings, *, lanes: int, half_sh: bool = False) -> list[Stage]:
-    """Stages of drawing a picture for the eye.
+def forward_floor(work: Work, ceilings: Ceilings, *, lanes: int, prepared: bool = False) -> list[Stage]:
+    """Stages of drawing a picture.
 
     Args:
         lanes: Floats in a register: 4, 8 or 16.
-        half_sh: The SH are stored in float16.
+        prepared: For the eye: SH stored in float16, 8-bit pixels; else all in float32, with depth.
     """
     flops = work.drawn * (PROJECT_FLOPS + SH_FLOPS * work.sh_count)
-    sh_bytes = 3 * work.sh_count * (FLOAT // 2 if half_sh else FLOAT)
+    sh_bytes = 3 * work.sh_count * (FLOAT // 2 if prepared else FLOAT)
     parameters = work.gaussians * (GEOMETRY_FLOATS * FLOAT + sh_bytes)
-    blend = work.lanes[lanes] * (EVALUATE_FLOPS + ACCUMULATE_FLOPS)
+    blend = work.lanes[lanes] * (EVALUATE_FLOPS + (PLAY_FLOPS if prepared else ACCUMULATE_FLOPS))
+    written = work.pixels * (PLAY_BYTES if prepared else TRAIN_FLOATS * FLOAT)
     return [
         _stage("project", flops, parameters, ceilings, ceilings.dram_read),
         _sort("sort", SORT_PASSES * work.drawn, ceilings),
         _sort("bin", BIN_PASSES * work.pairs, ceilings),
         _stage("blend", blend, work.pairs * SPLAT_FLOATS * FLOAT, ceilings, ceilings.l2_read),
-        _stage("write", 0, work.pixels * PLAY_FLOATS * FLOAT, ceilings, ceilings.dram_copy),
+        _stage("write", 0, written, ceilings, ceilings.dram_copy),
     ]
 
 
@@ -95,7 +96,7 @@ def total_ms(stages: list[Stage]) -> float:
 
 def floors_ms(work: Work, ceilings: Ceilings, *, lanes: int) -> dict[str, float]:
     """Floors of `forward` (prepared Gaussians, SH in float16), `stateless` and `forward_backward`."""
-    play = total_ms(forward_floor(work, ceilings, lanes=lanes, half_sh=True))
+    play = total_ms(forward_floor(work, ceilings, lanes=lanes, prepared=True))
     forward = total_ms(forward_floor(work, ceilings, lanes=lanes))
     backward = total_ms(backward_floor(work, ceilings, lanes=lanes))
     return {"forward": play, "stateless": forward, "forward_backward": forward + backward}

@@ -12,6 +12,7 @@ from cap4d.evaluate.bench.scenes import Scene
 
 PASSES = ("forward", "stateless", "forward_backward")
 STAGES = ("project", "sort", "tiles", "rasterize")
+BLACK = (0.0, 0.0, 0.0)
 LANES = {"base": 4, "v3": 8, "v4": 16}
 
 
@@ -21,7 +22,8 @@ def lanes() -> int:
 
 
 class Playing:
-    """Drawing for the eye as a player does: Gaussians prepared once (colours in float16), buffers kept.
+    """Drawing for the eye as a player does: Gaussians prepared once (colours in float16), buffers kept, 8-bit
+    pixels.
 
     Calling it draws; `seconds` collects what each stage of each call took.
     """
@@ -29,12 +31,18 @@ class Playing:
     def __init__(self, scene: Scene, *, threads: int) -> None:
         self._splatter = _core.Splatter(*scene.fields)
         self._view, self._threads = scene.view, threads
+        self._pixels = np.empty((scene.camera.height, scene.camera.width, 4), np.uint8)
         self.seconds: list[dict[str, float]] = []
 
-    def __call__(self) -> tuple[np.ndarray, ...]:
-        image = self._splatter.render(*self._view, threads=self._threads)
+    def __call__(self) -> np.ndarray:
+        viewmat, K, _, _ = self._view
+        self._splatter.draw(self._pixels, viewmat, K, BLACK, threads=self._threads)
         self.seconds.append(self._splatter.seconds)
-        return image
+        return self._pixels
+
+    def rgb(self) -> np.ndarray:
+        """float32[H, W, 3] the picture before it is rounded to bytes."""
+        return self._splatter.render(*self._view, threads=self._threads)[0]
 
     def stage_ms(self) -> dict[str, float]:
         """Median milliseconds of each stage."""

@@ -100,7 +100,7 @@ def _compare(scene: Scene, truth: Picture, peers: dict[str, Peer], settings: Set
             row[f"{kind}_ratio"] = (
                 None if timing is None else round(timing.median_ms / timings[f"ours|{kind}"].median_ms, 2)
             )
-        picture = ours["forward"]()[0] if name == "ours" else peers[name].forward()
+        picture = ours["forward"].rgb() if name == "ours" else peers[name].forward()
         rows.append({**row, "error": picture_error(picture, truth.rgb)})
     return {"name": scene.name, "rows": rows}
 

@@ -23,7 +23,7 @@ def roofline(
     Args:
         measured: See `Playing.stage_ms`.
     """
-    play = forward_floor(work, ceilings, lanes=lanes(), half_sh=True)
+    play = forward_floor(work, ceilings, lanes=lanes(), prepared=True)
     train = forward_floor(work, ceilings, lanes=lanes()) + backward_floor(work, ceilings, lanes=lanes())
     found = [
         {

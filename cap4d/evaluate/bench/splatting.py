@@ -122,8 +122,9 @@ def _time_scenes(
 
 def _errors(scene: Scene, truth: Picture, settings: Settings) -> dict[str, Any]:
     """Of the pictures of `forward` and, in its own entry, `stateless`."""
-    pictures = [make(scene, threads=settings.threads)()[0] for make in (Playing, stateless)]
-    return {**picture_error(pictures[0], truth.rgb), "stateless": picture_error(pictures[1], truth.rgb)}
+    playing = Playing(scene, threads=settings.threads).rgb()
+    other = stateless(scene, threads=settings.threads)()[0]
+    return {**picture_error(playing, truth.rgb), "stateless": picture_error(other, truth.rgb)}
 
 
 def _memory(source: SceneSource, name: str, settings: Settings) -> dict[str, float | None]:
