@@ -13,8 +13,9 @@ from cap4d.app.options import Options
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.drive.source import open_source
+from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
-from cap4d.player.offline import Draw, Output, draw_on_cpu, render_to
+from cap4d.player.offline import Draw, Output, draw_on_cpu, pipeline_threads, render_to
 
 log = logging.getLogger(__name__)
 
@@ -23,15 +24,21 @@ def play_headless(path: Path, options: Options) -> None:
     """Renders the avatar at `path` to `options.out`, or to a video of its name in the current folder.
 
     Raises:
-        ArgumentError, DataError: See `cap4d.player.offline.render_to`.
+        ArgumentError, DataError: See `cap4d.player.offline.render_to`; `--pipeline` on another backend.
         GlUnavailableError: `--backend gl` without OpenGL 4.1.
     """
-    avatar = Avatar.load(path, deformer=options.deformer, deformer_budget_ms=math.inf)
+    threads = pipeline_threads() if options.pipeline else 0
+    avatar = Avatar.load(path, deformer=options.deformer, threads=threads, deformer_budget_ms=math.inf)
     clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
     backend, draw = choose_backend(options.backend, avatar)
+    if options.pipeline and backend != "cpu":
+        raise ArgumentError(f"pipeline: expected the cpu backend, got {backend}")
     out = options.out or f"{path.stem}.mp4"
     output = Output(out, frames=options.frames, size=options.size, stats=options.stats)
-    stats = render_to(avatar, clip, options.camera, output, draw=draw, backend=backend)
+    pipelined = options.pipeline
+    stats = render_to(
+        avatar, clip, options.camera, output, draw=draw, backend=backend, pipelined=pipelined
+    )
     log.info("%s: %d frames, %.1f fps (%s)", out, stats["frames"], stats["fps"], backend)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from collections.abc import Iterable
@@ -25,6 +26,8 @@ from cap4d.player.camera_path import CameraPath, camera_path, fitted
 from cap4d.player.offline import head_centre, statistics, write_stats
 from cap4d.player.video import check_file
 
+log = logging.getLogger(__name__)
+
 STAGES = ("rig", "deform", "bind", "sort", "splat", "encode")
 READ_OUT_SECONDS = 0.5  # between changes of the numbers shown
 IDLE_SECONDS = 0.25  # the longest sleep of a window that shows nothing new
@@ -39,6 +42,7 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     if options.stats is not None:
         check_file(options.stats, "stats")
     avatar = Avatar.load(path, deformer=options.deformer)
+    log.info("deformer: %s", avatar.tier)
     clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
     avatar.check_rig(clip.rig_name)
     cameras = camera_path(options.camera, avatar.camera, head_centre(avatar), fps=clip.fps, size=None)

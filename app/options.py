@@ -40,6 +40,7 @@ class Options:
     deformer: str
     size: tuple[int, int]
     headless: bool
+    pipeline: bool
     frames: int | None
     out: str | None
     camera: str
@@ -72,6 +73,11 @@ def build_parser() -> argparse.ArgumentParser:
     add("--deformer", choices=DEFORMERS, default="auto", help=DEFORMER_HELP)
     add("--size", type=_size, default=(512, 512), metavar="WxH", help="picture, or window (default: 512x512)")
     add("--headless", action="store_true", help="no window: render to --out")
+    add(
+        "--pipeline",
+        action="store_true",
+        help="headless on the cpu: work out the next frame's face while a frame is drawn",
+    )
     add(
         "--frames", type=_count, metavar="N", help="stop after N frames (headless: default is the clip, once)"
     )

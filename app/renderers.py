@@ -9,8 +9,6 @@ import numpy as np
 from cap4d.app.shader_source import build_program
 from cap4d.app.splat_pass import BoundGaussians, SplatPass
 
-from cap4d import _core
-from cap4d.bind import bind_fast
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.player.avatar import Avatar
@@ -41,8 +39,6 @@ class GlRenderer:
 
     def __init__(self, ctx: moderngl.Context, avatar: Avatar) -> None:
         self.ctx, self.avatar = ctx, avatar
-        bundle = avatar.bundle
-        self.local = {name: getattr(bundle, name) for name in ("means", "quats", "log_scales", "binding")}
         self.splats = SplatPass(ctx, bound_gaussians(avatar))
         self.overlay = Overlay(ctx)
         self.target: moderngl.Framebuffer | None = None
@@ -50,13 +46,10 @@ class GlRenderer:
     def texture(self, frame: Frame, camera: Camera) -> moderngl.Texture:
         """See `Renderer`."""
         avatar, stages = self.avatar, self.avatar.stages
-        avatar.check_rig(frame.rig_name)
-        rotations = {name: getattr(frame, name) for name in ("eye_rot", "neck_rot", "jaw_rot")}
-        vertices = avatar.vertices(frame.expr, **rotations)
-        with stages.time("bind"):
-            means, _, _ = bind_fast(vertices, avatar.bundle.grid.faces, threads=avatar.threads, **self.local)
-        with stages.time("sort"):
-            order = _core.sort_by_depth(means, camera.viewmat.astype(np.float32), avatar.threads)
+        vertices = avatar.move(frame)
+        order = avatar.splatter.order(camera.viewmat, vertices, avatar.threads)
+        for stage in ("bind", "sort"):
+            stages.add(stage, avatar.splatter.seconds[stage])
         with stages.time("splat"):
             picture = self.splats.draw(vertices, order, camera)
             self.ctx.finish()
@@ -118,7 +111,9 @@ class Overlay:
 
 
 def bound_gaussians(avatar: Avatar) -> BoundGaussians:
-    """The avatar's Gaussians as `SplatPass` takes them."""
-    bundle = avatar.bundle
-    raw = {name: getattr(bundle, name) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")}
-    return BoundGaussians(**raw, triangles=bundle.grid.faces[bundle.binding], grid_size=len(bundle.grid))
+    """The avatar's Gaussians as `SplatPass` takes them, in the order of its splatter."""
+    bundle, order = avatar.bundle, avatar.gaussian_order
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    raw = {name: getattr(bundle, name)[order] for name in names}
+    triangles = bundle.grid.faces[bundle.binding[order]]
+    return BoundGaussians(**raw, triangles=triangles, grid_size=len(bundle.grid))

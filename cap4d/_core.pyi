@@ -110,7 +110,7 @@ class QuantizedUnet:
     other.
     """
 
-    isa: ClassVar[Literal["base", "v3", "v4", "vnni"]]
+    isa: ClassVar[Literal["base", "v3", "avxvnni", "v4", "vnni"]]
     """The variant of the inner loops in use."""
 
     def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:
@@ -172,11 +172,11 @@ class Splatter:
         """Memory held."""
     @property
     def seconds(self) -> dict[str, float]:
-        """Of the last picture: bind, project, sort, tiles, rasterize."""
+        """Of the last picture or order: bind, project, sort, tiles, rasterize."""
 
 @final
 class GridSurface:
-    """The head on the grid's G vertices: basis [K, G, 3] (expressions, pose correctives), skin_weights [J, G]."""
+    """The head on the grid's G vertices: basis [K, G, 3] (expressions, correctives), skin_weights [J, G]."""
 
     def __init__(
         self,
@@ -210,3 +210,15 @@ def isa() -> Literal["base", "v3", "v4"]:
 
 def default_threads() -> int:
     """What `threads=0` means: the hardware's, or CAP4D_THREADS."""
+
+def multiply_add_rate(threads: int, seconds: float = 0.3) -> float:
+    """The machine's float32 operations a second; a multiply-add is two. Best of about `seconds`."""
+
+def copy_rate(bytes: int, threads: int, seconds: float = 0.3) -> float:
+    """Bytes read and written a second by copies that touch `bytes` in all."""
+
+def read_rate(bytes: int, threads: int, seconds: float = 0.3) -> float:
+    """Bytes a second of reading `bytes` again and again."""
+
+def sort_pass_rate(count: int, threads: int, seconds: float = 0.3) -> float:
+    """Keys a second through one pass of an 8-bit radix sort of `count` keys and values a thread."""

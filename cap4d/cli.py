@@ -26,6 +26,12 @@ EXAMPLES = """examples:
 HELD_OUT = """held-out frames (every 10th and the last tenth of a video, or those the capture marks) are never
 trained on; their expressions and poses come from the tracker, which sees all frames."""
 
+OPTIMIZE = """Takes out what is not used, picks the cheapest deformer, stores numbers in fewer bits,
+lowers the degree of the spherical harmonics and prunes Gaussians; each only while the pictures stay near
+enough to those of the full avatar in float64. The error is the squared error pooled over frames of the
+idle clip, from the default view and around it, on black and on white. Steps learn from other frames than
+it is measured on."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
@@ -45,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--version", action="version", version=f"cap4d {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for add in (add_demo, add_rig, add_track, add_fit, add_render, add_inspect):
+    for add in (add_demo, add_rig, add_track, add_fit, add_optimize, add_render, add_inspect, add_bench):
         add(commands)
     return parser
 
@@ -356,6 +362,44 @@ def run_fit(arguments: argparse.Namespace) -> None:
     )
 
 
+# optimize -----------------------------------------------------------------------------------------
+
+
+def add_optimize(commands) -> None:
+    parser = command(
+        commands,
+        "optimize",
+        run_optimize,
+        "make an avatar's file smaller and its frames faster, to a stated error",
+        "cap4d optimize me.cap4d --max-error 45dB -o small.cap4d",
+        more=OPTIMIZE,
+    )
+    add_avatar(parser)
+    parser.add_argument("--max-error", metavar="45dB", help="PSNR that the pictures must keep")
+    parser.add_argument("--max-size", metavar="20MB", help="size that the file must have, at the least error")
+    parser.add_argument(
+        "--capture", type=Path, metavar="CAPTURE", help="look at the training views of this capture too"
+    )
+    add_output(parser, "SMALL.cap4d", "avatar to write; replaced if it exists, and never AVATAR itself")
+
+
+def run_optimize(arguments: argparse.Namespace) -> None:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the viewer
+    from cap4d.optimize.limit import parse_decibels, parse_size
+    from cap4d.optimize.optimize import optimize
+    from cap4d.optimize.report import table
+
+    check_output(arguments.output)
+    report = optimize(
+        arguments.avatar,
+        arguments.output,
+        max_error_db=None if arguments.max_error is None else parse_decibels(arguments.max_error),
+        max_bytes=None if arguments.max_size is None else parse_size(arguments.max_size),
+        capture=arguments.capture,
+    )
+    print(table(report))
+
+
 # render, inspect ----------------------------------------------------------------------------------
 
 
@@ -392,6 +436,9 @@ def add_render(commands) -> None:
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="out.mp4, frame_%%04d.png or one.png"
     )
+    parser.add_argument(
+        "--pipeline", action="store_true", help="work out the next frame's face while a frame is drawn"
+    )
     parser.add_argument("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
 
 
@@ -410,6 +457,7 @@ def run_render(arguments: argparse.Namespace) -> None:
         frames=arguments.frames,
         stats=arguments.stats,
         deformer=arguments.deformer,
+        pipelined=arguments.pipeline,
     )
 
 
@@ -424,6 +472,66 @@ def run_inspect(arguments: argparse.Namespace) -> None:
     from cap4d.bundle.inspect import describe
 
     print(describe(arguments.avatar))
+
+
+# bench --------------------------------------------------------------------------------------------
+
+
+def add_bench(commands) -> None:
+    parser = command(
+        commands,
+        "bench",
+        run_bench,
+        "measure speed against error, and write a report",
+        "cap4d bench --report bench --avatar me.cap4d",
+        more="Splatter, fitting step, deformer and whole frames, beside the machine's ceilings and peers.",
+    )
+    parser.add_argument(
+        "--report",
+        type=Path,
+        default=Path("bench"),
+        metavar="FOLDER",
+        help="for report.md, report.json and plots; made when missing (default: bench)",
+    )
+    parser.add_argument(
+        "--scenes",
+        type=Path,
+        metavar="FOLDER",
+        help="head_30k.npz ... bad_100k.npz and cameras.json (default: the package's own scenes)",
+    )
+    parser.add_argument(
+        "--avatar",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="avatars for the deformer and whole frames (default: none, and those sections are left out)",
+    )
+    parser.add_argument(
+        "--only",
+        metavar="SECTIONS",
+        help="some of ceilings,splat,fit,deformer,frame,optimize,peers (default: all)",
+    )
+    parser.add_argument("--threads", type=int, default=2, metavar="N", help="of everything (default: 2)")
+    parser.add_argument("--quick", action="store_true", help="small and short: to see that it runs")
+
+
+def run_bench(arguments: argparse.Namespace) -> None:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the viewer
+    from cap4d.errors import ArgumentError
+    from cap4d.evaluate.bench.run import bench, parse_sections
+    from cap4d.evaluate.bench.settings import SECTIONS, Settings
+
+    if not 1 <= arguments.threads <= 256:
+        raise ArgumentError(f"threads: expected 1 to 256, got {arguments.threads}")
+    settings = Settings(
+        sections=SECTIONS if arguments.only is None else parse_sections(arguments.only),
+        threads=arguments.threads,
+        quick=arguments.quick,
+        avatars=tuple(arguments.avatar),
+        scenes=arguments.scenes,
+    )
+    bench(arguments.report, settings)
 
 
 if __name__ == "__main__":

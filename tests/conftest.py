@@ -16,7 +16,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     skip = pytest.mark.skip(reason="a bench; run with `pytest -m bench`")
     for item in items:
-        if "bench" in item.keywords:
+        if item.get_closest_marker("bench"):
             item.add_marker(skip)
 
 

@@ -46,10 +46,11 @@ def write_container(path: Path, entries: Mapping[str, bytes]) -> None:
     The same entries give the same bytes. When anything fails, `path` is as it was.
     """
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        _write(file, entries)
+        put_entries(file, entries)
 
 
-def _write(file: BinaryIO, entries: Mapping[str, bytes]) -> None:
+def put_entries(file: BinaryIO, entries: Mapping[str, bytes]) -> None:
+    """Writes the entries into an open, empty file."""
     directory = b""
     for name, data in entries.items():
         raw, crc, offset = name.encode("ascii"), zlib.crc32(data), file.tell()

@@ -98,7 +98,7 @@ class Manifest:
         }
         if self.tier_errors:
             document["deformer"] = {
-                tier: {"rms_mm": rms, "max_mm": worst}
+                tier: {"rms_mm": float(f"{rms:.6g}"), "max_mm": float(f"{worst:.6g}")}
                 for tier, (rms, worst) in sorted(self.tier_errors.items())
             }
         return (json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True) + "\n").encode()

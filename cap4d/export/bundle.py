@@ -1,9 +1,11 @@
-"""A fitted avatar as the file a player opens: its network as ONNX, its Gaussians raw, an idle clip, a
+"""A fitted avatar as the file a player opens: its network in every form, its Gaussians raw, an idle clip, a
 picture.
 """
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,9 @@ from cap4d.drive.clip import Clip
 from cap4d.errors import Cap4dError
 from cap4d.export.deformer import export_deformer, worst_difference
 from cap4d.export.idle import idle_clip
+from cap4d.export.tiers import distance, with_tiers
 from cap4d.gaussians import Gaussians
+from cap4d.player.deformer import Deformer
 from cap4d.player.png import encode_png
 from cap4d.render import render
 from cap4d.rig.grid import remesh
@@ -57,7 +61,7 @@ def make_bundle(model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Cli
     mesh_subject = rig.subject(capture.shape)
     camera = default_camera(capture, clip)
     local = {name: value.detach().numpy() for name, value in model.gaussians.items()}
-    return Bundle(
+    bundle = Bundle(
         rig_licence=rig.licence,
         expression_range=np.asarray(rig.expression_range, np.float32),
         grid=model.grid,
@@ -75,6 +79,10 @@ def make_bundle(model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Cli
         preview=preview(model, clip, camera),
         mesh_subject=mesh_subject,
     )
+    if model.deformer is None:
+        return bundle
+    bundle = with_tiers(bundle, [clip])
+    return replace(bundle, tier_errors={"full": float32_error(bundle, model, clip), **bundle.tier_errors})
 
 
 def checked_onnx(model: AvatarModel, clip: Clip) -> bytes:
@@ -84,15 +92,32 @@ def checked_onnx(model: AvatarModel, clip: Clip) -> bytes:
         Cap4dError: They differ by more than 1e-5 of the answers' range.
     """
     data = export_deformer(model.deformer)
-    frames = np.linspace(0, len(clip) - 1, min(COMPARED_FRAMES, len(clip))).round().astype(int)
-    with torch.no_grad():
-        offsets = torch.stack([model.offsets(Pose.of(clip.frame(t))) for t in frames])
-    difference = worst_difference(data, model.deformer, offsets)
+    difference = worst_difference(data, model.deformer, sampled_offsets(model, clip))
     if difference > WORST_ONNX_DIFFERENCE:
         raise Cap4dError(
             f"deform.onnx: expected within {WORST_ONNX_DIFFERENCE:g} of torch, found {difference:.2g}"
         )
     return data
+
+
+def float32_error(bundle: Bundle, model: AvatarModel, clip: Clip) -> tuple[float, float]:
+    """(RMS, largest) distance, mm, of the `full` network's answers from torch's in float64, some frames."""
+    network, exact = (
+        Deformer(bundle.deform_onnx, size=bundle.grid.size),
+        copy.deepcopy(model.deformer).double(),
+    )
+    offsets = sampled_offsets(model, clip)
+    with torch.no_grad():
+        expected = torch.cat([exact(o[None].double()) for o in offsets]).numpy()
+    found = np.stack([network(o.numpy()).copy() for o in offsets])  # its own arrays, used again
+    return distance(*(bundle.grid.from_map(maps)[:, bundle.grid.deformable] for maps in (found, expected)))
+
+
+def sampled_offsets(model: AvatarModel, clip: Clip) -> torch.Tensor:
+    """[COMPARED_FRAMES, 3, S, S] m: what the network is given on frames of a clip."""
+    frames = np.linspace(0, len(clip) - 1, min(COMPARED_FRAMES, len(clip))).round().astype(int)
+    with torch.no_grad():
+        return torch.stack([model.offsets(Pose.of(clip.frame(t))) for t in frames])
 
 
 def default_camera(capture: Capture, clip: Clip) -> Camera:

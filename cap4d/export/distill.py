@@ -1,10 +1,10 @@
 """Distils the deformation network to lines: a displacement per unit of each expression, on the grid.
 
-Ridge regression (Hoerl and Kennard 1970) from expressions to what the network answers, before skinning, so that
-the result can be added to a head's expression basis and costs nothing per frame. It learns from frames, jittered
-frames and single expressions alike: without the singles it is off by twice as much on them (0.106 mm instead of
-0.050 on a talking head) and no nearer on frames (0.047 and 0.046). How strongly to shrink is what serves frames
-best that were left out.
+Ridge regression (Hoerl and Kennard 1970) from expressions to what the network answers, before skinning, so
+that the result can be added to a head's expression basis and costs nothing per frame. It learns from frames,
+jittered frames and single expressions alike: without the singles it is off by twice as much on them (0.106 mm
+instead of 0.050 on a talking head) and no nearer on frames (0.047 and 0.046). How strongly to shrink is what
+serves frames best that were left out.
 """
 
 from __future__ import annotations
@@ -80,8 +80,9 @@ def _chosen(kinds: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 
 
 def _errors(kinds: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """[len(SHRINKAGES)] squared errors on blocks of frames, plain and jittered, that were left out in turn, but
-    for what does not depend on the shrinkage.
+    """[len(SHRINKAGES)] squared errors on blocks of frames that were left out in turn, plain and jittered.
+
+    What does not depend on the shrinkage is left out of them.
     """
     frames, errors = len(kinds[0][0]), np.zeros(len(SHRINKAGES))
     fold = np.arange(frames) * FOLDS // frames

@@ -11,7 +11,7 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.camera import opencv_from_rig
 from cap4d.drive.clip import Clip
 
-FRAMES, HELD_OUT_FRAMES = 192, 64  # of clips, at most
+FRAMES, HELD_OUT_FRAMES = 128, 48  # of clips, at most
 BLOCK_SECONDS = 1.0  # neighbours in time are alike: every fourth block is held out, not every fourth frame
 HELD_OUT_BLOCK = 3  # of 4
 JITTER = 0.05  # of an expression's range, standard deviation
@@ -43,9 +43,7 @@ class Expressions:
 
 @dataclass(frozen=True, eq=False)
 class OwnExpressions:
-    """The three kinds: frames of clips, the same frames with every expression jittered, and single expressions
-    with the rest of the face at rest.
-    """
+    """Frames of clips, the same with every expression jittered, and single expressions of a face at rest."""
 
     frames: Expressions
     jittered: Expressions
@@ -85,8 +83,9 @@ def offset_maps(bundle: Bundle, expressions: Expressions) -> Iterator[np.ndarray
 
 
 def _split(clips: Sequence[Clip], span: np.ndarray) -> tuple[Expressions, Expressions]:
-    """Frames to fit to and frames to hold out. The idle clip may repeat the capture's frames: whatever is like
-    a frame that is held out is not fitted to.
+    """Frames to fit to and frames to hold out.
+
+    The idle clip may repeat the capture's frames: whatever is like a held-out frame is not fitted to.
     """
     frames = Expressions.joined([Expressions(c.expr, c.eye_rot, c.jaw_rot) for c in clips])
     blocks = np.concatenate([np.arange(len(c)) // max(1, round(BLOCK_SECONDS * c.fps)) for c in clips])

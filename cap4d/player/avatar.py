@@ -121,7 +121,7 @@ class Avatar:
         return out
 
     def move(self, frame: Frame) -> np.ndarray:
-        """`vertices` of a driven frame, in memory of the avatar's own: the call after the next overwrites it."""
+        """`vertices` of a driven frame, in the avatar's own memory: the call after the next overwrites it."""
         self.check_rig(frame.rig_name)
         self._vertices.reverse()
         rotations = {name: getattr(frame, name) for name in ("eye_rot", "neck_rot", "jaw_rot")}

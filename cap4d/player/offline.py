@@ -8,6 +8,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar, Tier
 from cap4d.player.camera_path import CameraPath, camera_path
+from cap4d.player.deformer import default_threads
 from cap4d.player.stages import peak_memory_mb
 from cap4d.player.video import MAX_SIDE, VideoWriter, check_file, check_output
 
@@ -67,6 +69,7 @@ def render_clip(
     frames: int | None = None,
     fps: float | None = None,
     draw: Draw = draw_on_cpu,
+    pipelined: bool = False,
 ) -> Iterator[np.ndarray]:
     """Draws a clip, frame by frame.
 
@@ -76,6 +79,7 @@ def render_clip(
         frames: How many pictures; None is the clip, once.
         fps: Pictures per second; None is the clip's own rate, and another rate interpolates.
         draw: The backend.
+        pipelined: Work out the next frame's face while a frame is drawn, on the CPU: see `pipelined_images`.
     Yields:
         uint8[H, W, 3] sRGB.
     Raises:
@@ -83,12 +87,43 @@ def render_clip(
     """
     avatar.check_rig(clip.rig_name)
     fps = fps or clip.fps
-    for index in range(frame_count(clip, frames, fps)):
-        start = time.perf_counter()
-        frame = sample(clip, index / fps)
-        image = draw(avatar, frame, path(index, frame))
+    driven = ((i, sample(clip, i / fps)) for i in range(frame_count(clip, frames, fps)))
+    if pipelined:
+        images = pipelined_images(avatar, driven, path)
+    else:
+        images = (draw(avatar, frame, path(index, frame)) for index, frame in driven)
+    start = time.perf_counter()
+    for image in images:
         avatar.stages.add("frame", time.perf_counter() - start)
         yield np.ascontiguousarray(image[..., :3])
+        start = time.perf_counter()
+
+
+def pipelined_images(
+    avatar: Avatar, driven: Iterator[tuple[int, Frame]], path: CameraPath
+) -> Iterator[np.ndarray]:
+    """Pictures on white, each drawn while a second thread poses the frame after it.
+
+    More of them a second where posing and drawing leave cores idle by themselves; each comes a frame later
+    than it could. Give the avatar fewer threads than there are cores, or the two get in each other's way.
+    """
+    with ThreadPoolExecutor(1) as worker:
+
+        def begin() -> tuple[int, Frame, Future[np.ndarray]] | None:
+            index, frame = next(driven, (0, None))
+            return None if frame is None else (index, frame, worker.submit(avatar.move, frame))
+
+        ahead = begin()
+        while ahead is not None:
+            index, frame, moving = ahead
+            vertices = moving.result()
+            ahead = begin()
+            yield avatar.splat(vertices, path(index, frame), background=WHITE)
+
+
+def pipeline_threads() -> int:
+    """How many of the cores posing and drawing get each, when they run side by side."""
+    return max(1, default_threads() // 2)
 
 
 def frame_count(clip: Clip, frames: int | None, fps: float) -> int:
@@ -111,12 +146,14 @@ def render_to(
     *,
     draw: Draw = draw_on_cpu,
     backend: str = "cpu",
+    pipelined: bool = False,
 ) -> dict[str, Any]:
     """Draws a clip into a file and returns (and writes, if asked) the statistics.
 
     Args:
         camera: `static`, `orbit` or a file, see `camera_path`.
         backend: Name of `draw`, for the statistics.
+        pipelined: See `render_clip`.
     Raises:
         ArgumentError, DataError: Before anything is written.
     """
@@ -128,7 +165,7 @@ def render_to(
     if output.path is not None:
         view = path(0, clip.frame(0))
         check_output(Path(output.path), fps=fps, frames=total, size=(view.width, view.height))
-    images = render_clip(avatar, clip, path, frames=total, fps=fps, draw=draw)
+    images = render_clip(avatar, clip, path, frames=total, fps=fps, draw=draw, pipelined=pipelined)
     first = next(images)
     avatar.stages.clear()  # the first frame loads what the others find loaded
     start = shown = time.perf_counter()
@@ -159,15 +196,17 @@ def render_file(
     frames: int | None = None,
     stats: Path | None = None,
     deformer: Tier = "auto",
+    pipelined: bool = False,
 ) -> dict[str, Any]:
     """`cap4d render`: see `render_to`; `drive`, `template` and `fps` are `open_source`'s, `size` is `WxH`.
 
     Nobody waits for a file, and it should not depend on the machine: `auto` is the most exact deformer.
     """
-    player = Avatar.load(avatar, deformer=deformer, deformer_budget_ms=math.inf)
+    threads = pipeline_threads() if pipelined else 0
+    player = Avatar.load(avatar, deformer=deformer, threads=threads, deformer_budget_ms=math.inf)
     clip = open_source(drive, player.bundle, template=template, fps=fps)
     wanted = Output(output, frames=frames, size=None if size is None else parse_size(size), stats=stats)
-    found = render_to(player, clip, camera, wanted)
+    found = render_to(player, clip, camera, wanted, pipelined=pipelined)
     log.info("%s: %d frames, %.1f fps", output, found["frames"], found["fps"])
     return found
 

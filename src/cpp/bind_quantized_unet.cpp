@@ -26,9 +26,11 @@ class Tensors {
   std::span<const T> take(const std::string& name, std::initializer_list<py::ssize_t> shape) const {
     if (!dict_.contains(name)) throw std::invalid_argument(name + ": expected a tensor, got nothing");
     const py::object value = dict_[name.c_str()];
-    if (!py::isinstance<py::array_t<T, py::array::c_style>>(value)) throw std::invalid_argument(name + ": expected a contiguous array of " + py::str(py::dtype::of<T>()).cast<std::string>());
+    if (!py::isinstance<py::array_t<T, py::array::c_style>>(value))
+      throw std::invalid_argument(name + ": expected a contiguous array of " + py::str(py::dtype::of<T>()).cast<std::string>());
     const auto array = py::reinterpret_borrow<py::array_t<T, py::array::c_style>>(value);
-    if (array.ndim() != static_cast<py::ssize_t>(shape.size()) || !std::equal(shape.begin(), shape.end(), array.shape())) throw std::invalid_argument(name + ": wrong shape");
+    if (array.ndim() != static_cast<py::ssize_t>(shape.size()) || !std::equal(shape.begin(), shape.end(), array.shape()))
+      throw std::invalid_argument(name + ": wrong shape");
     return {array.data(), static_cast<std::size_t>(array.size())};
   }
 
@@ -57,7 +59,7 @@ ActivationTensors take_activation(const Tensors& tensors, const std::string& nam
 }
 
 UnetTensors take_all(const Tensors& tensors, int size) {
-  if (size < 8 || size > kMaxUnetSize || (size & (size - 1))) throw std::invalid_argument("size: expected a power of two in [8, 512], got " + std::to_string(size));
+  check_unet_size(size);
   const int depth = unet_depth(size), half = size / 2, width = tensors.width();
   UnetTensors t{};
   t.size = size, t.width = width;
@@ -95,7 +97,8 @@ FloatArray run(QuantizedUnet& net, FloatArray offsets, int threads) {
   const py::ssize_t size = net.size();
   if (offsets.ndim() != 3 || offsets.shape(0) != 3 || offsets.shape(1) != size || offsets.shape(2) != size)
     throw std::invalid_argument("offsets: expected float32[3, " + std::to_string(size) + ", " + std::to_string(size) + "]");
-  if (!std::all_of(offsets.data(), offsets.data() + offsets.size(), [](float x) { return std::isfinite(x); })) throw std::invalid_argument("offsets: expected finite numbers, got one that is not");
+  if (!std::all_of(offsets.data(), offsets.data() + offsets.size(), [](float x) { return std::isfinite(x); }))
+    throw std::invalid_argument("offsets: expected finite numbers, got one that is not");
   FloatArray out({py::ssize_t{3}, size, size});
   float* to = out.mutable_data();
   {

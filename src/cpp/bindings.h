@@ -4,6 +4,7 @@
 
 namespace cap4d {
 void register_bind(pybind11::module_& m);
+void register_ceilings(pybind11::module_& m);
 void register_grid_surface(pybind11::module_& m);
 void register_mesh(pybind11::module_& m);
 void register_quantized_unet(pybind11::module_& m);

@@ -1,11 +1,15 @@
 #include "kernels.h"
 
-#include "quantized_layers.h"
-
 #include <cstdlib>
 #include <stdexcept>
 #include <string>
 #include <string_view>
+
+#include "quantized_layers.h"
+
+#ifdef CAP4D_HAS_X86_VARIANTS
+#include <cpuid.h>
+#endif
 
 namespace cap4d {
 
@@ -20,6 +24,9 @@ extern const UnetKernels kUnetKernels;
 }
 namespace v4 {
 extern const Kernels kKernels;
+extern const UnetKernels kUnetKernels;
+}
+namespace avxvnni {
 extern const UnetKernels kUnetKernels;
 }
 namespace vnni {
@@ -53,11 +60,20 @@ const Kernels& choose() {
   return base::kKernels;
 }
 
+#ifdef CAP4D_HAS_X86_VARIANTS
+// The 256-bit VNNI of processors without AVX-512. Clang's __builtin_cpu_supports does not know it.
+bool has_avxvnni() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  return __get_cpuid_count(7, 1, &a, &b, &c, &d) && (a >> 4 & 1);
+}
+#endif
+
 const UnetKernels& choose_unet() {
 #ifdef CAP4D_HAS_X86_VARIANTS
   const std::string_view level = kernels().isa;
-  if (level == "v4") return wanted() == "vnni" && __builtin_cpu_supports("avx512vnni") ? vnni::kUnetKernels : v4::kUnetKernels;
-  if (level == "v3") return v3::kUnetKernels;
+  const bool vnni = wanted() == "vnni";
+  if (level == "v4") return vnni && __builtin_cpu_supports("avx512vnni") ? vnni::kUnetKernels : v4::kUnetKernels;
+  if (level == "v3") return vnni && has_avxvnni() ? avxvnni::kUnetKernels : v3::kUnetKernels;
 #endif
   return base::kUnetKernels;
 }

@@ -4,6 +4,7 @@
 PYBIND11_MODULE(_core, m) {
   m.doc() = "Fast maths of cap4d, without Python inside.";
   cap4d::register_bind(m);
+  cap4d::register_ceilings(m);
   cap4d::register_grid_surface(m);
   cap4d::register_mesh(m);
   cap4d::register_quantized_unet(m);

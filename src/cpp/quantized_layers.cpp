@@ -21,13 +21,22 @@ namespace {
 // Without VNNI bytes are widened to 16 bits: the even ones and the odd ones of each lane separately, so that neither needs a shuffle.
 // pmaddubsw would be shorter, but saturates.
 
-#if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
+#if (defined(CAP4D_AVX512) && defined(__AVX512VNNI__)) || (!defined(CAP4D_AVX512) && defined(__AVXVNNI__))
+#define CAP4D_VNNI 1
+#endif
+
+#ifdef CAP4D_VNNI
 typedef IntV Weights;
 typedef IntV Inputs;
 CAP4D_INLINE Weights unpack(IntV w) { return w; }
-CAP4D_INLINE Inputs spread(std::int32_t four) { return reinterpret_cast<IntV>(_mm512_set1_epi32(four)); }
+CAP4D_INLINE Inputs split(IntV all) { return all; }
+CAP4D_INLINE Inputs spread(std::int32_t four) { return four - IntV{}; }
 CAP4D_INLINE IntV dot4(IntV sum, Inputs a, const Weights& w) {
+#ifdef CAP4D_AVX512
   return reinterpret_cast<IntV>(_mm512_dpbusd_epi32(reinterpret_cast<__m512i>(sum), reinterpret_cast<__m512i>(a), reinterpret_cast<__m512i>(w)));
+#else
+  return reinterpret_cast<IntV>(_mm256_dpbusd_avx_epi32(reinterpret_cast<__m256i>(sum), reinterpret_cast<__m256i>(a), reinterpret_cast<__m256i>(w)));
+#endif
 }
 #else
 struct Weights {
@@ -37,14 +46,19 @@ struct Inputs {
   IntV even, odd;
 };
 typedef std::int16_t ShortV __attribute__((vector_size(4 * kLanes)));
+typedef std::uint16_t UShortV __attribute__((vector_size(4 * kLanes)));
 
 CAP4D_INLINE Weights unpack(IntV w) {
   const ShortV pairs = reinterpret_cast<ShortV>(w);
   return {reinterpret_cast<IntV>((pairs << 8) >> 8), reinterpret_cast<IntV>(pairs >> 8)};
 }
+CAP4D_INLINE Inputs split(IntV all) { return {all & 0x00ff00ff, reinterpret_cast<IntV>(reinterpret_cast<UShortV>(all) >> 8)}; }
 CAP4D_INLINE Inputs spread(std::int32_t four) {
-  const IntV all = four - IntV{};
-  return {all & 0x00ff00ff, (all >> 8) & 0x00ff00ff};
+  IntV all = four - IntV{};
+#ifdef __SSE2__
+  asm("" : "+x"(all));  // GCC would mask the number before it is spread, and so take both halves through general registers
+#endif
+  return split(all);
 }
 CAP4D_INLINE IntV madd(IntV a, IntV b) {
 #if defined(CAP4D_AVX512)
@@ -57,7 +71,7 @@ CAP4D_INLINE IntV madd(IntV a, IntV b) {
   return (a & 0xffff) * ((b << 16) >> 16) + (a >> 16) * (b >> 16);  // a holds no negative numbers
 #endif
 }
-CAP4D_INLINE IntV dot4(IntV sum, const Inputs& a, const Weights& w) { return sum + madd(a.even, w.even) + madd(a.odd, w.odd); }
+CAP4D_INLINE IntV dot4(IntV sum, const Inputs& a, const Weights& w) { return sum + (madd(a.even, w.even) + madd(a.odd, w.odd)); }
 #endif
 
 CAP4D_INLINE IntV load_int(const void* p) {
@@ -78,6 +92,7 @@ constexpr int kTilePixels = 12, kTileVectors = 2;
 #else
 constexpr int kTilePixels = 4, kTileVectors = 2;
 #endif
+static_assert(kTilePixels % 4 == 0);  // what is left over is a multiple of 4
 
 template <int kPixels, int kVectors>
 CAP4D_INLINE void dot_tile(const DotJob& job, std::size_t first, int column) {
@@ -158,7 +173,8 @@ CAP4D_INLINE Quantum quantum(const Requantizer& to, int channel) {
   return to.image ? Quantum{load(to.inverse_scale + channel), load(to.zero + channel)} : Quantum{};
 }
 
-CAP4D_INLINE void activate(FloatV x, const Requantizer& leaky, const Quantum& leaky_q, const Requantizer& relu, const Quantum& relu_q, std::size_t at) {
+CAP4D_INLINE void activate(FloatV x, const Requantizer& leaky, const Quantum& leaky_q, const Requantizer& relu, const Quantum& relu_q,
+                           std::size_t at) {
   if (leaky.image) store_bytes(leaky.image + at, max(x, x * kLeak) * leaky_q.inverse_scale + leaky_q.zero);
   if (relu.image) store_bytes(relu.image + at, max(x, FloatV{}) * relu_q.inverse_scale + relu_q.zero);
 }
@@ -176,7 +192,7 @@ void requantize(const RequantizeJob& job) {
 
 // ---- The first layer ----------------------------------------------------------------------------------------------------------------
 
-constexpr int kFirstLines = 2 * kFirstBand + 2;
+constexpr int kFirstLines = 2 * kFirstBand + 2, kFirstStride = kMaxUnetSize + 2;
 #if defined(CAP4D_AVX512)
 constexpr int kFirstPixels = 8;  // at once
 #else
@@ -185,7 +201,7 @@ constexpr int kFirstPixels = 4;
 
 // What a band of output rows reads: [line][axis][x], masked, with a zero on every side.
 struct FirstLines {
-  float value[kFirstLines][3][kMaxUnetSize + 2];
+  float value[kFirstLines][3][kFirstStride];
 };
 
 void fill_lines(const FirstJob& job, FirstLines& lines) {
@@ -218,15 +234,13 @@ CAP4D_INLINE void first_tile(const FirstJob& job, const FirstLines& lines, int r
     for (int v = 0; v < kVectors; ++v)
       sum[p][v] = load(table(job.rows, edge(x + p), y) + v * kLanes) + load(table(job.columns, edge(y), x + p) + v * kLanes);
   const float* weights = job.weights + c;
-  for (int line = 0; line < 4; ++line)
-    for (int axis = 0; axis < 3; ++axis)
-      for (int column = 0; column < 4; ++column, weights += channels) {
-        const float* input = lines.value[2 * row + line][axis] + 2 * x + column;
-        FloatV w[kVectors];
-        for (int v = 0; v < kVectors; ++v) w[v] = load(weights + v * kLanes);
-        for (int p = 0; p < kPixels; ++p)
-          for (int v = 0; v < kVectors; ++v) sum[p][v] = sum[p][v] + w[v] * input[2 * p];
-      }
+  for (int tap = 0; tap < kFirstTaps; ++tap, weights += channels) {
+    const float* input = lines.value[2 * row][0] + tap / 4 * kFirstStride + 2 * x + tap % 4;
+    FloatV w[kVectors];
+    for (int v = 0; v < kVectors; ++v) w[v] = load(weights + v * kLanes);
+    for (int p = 0; p < kPixels; ++p)
+      for (int v = 0; v < kVectors; ++v) sum[p][v] = sum[p][v] + w[v] * input[2 * p];
+  }
   for (int v = 0; v < kVectors; ++v) {
     const int at = c + v * kLanes;
     const Quantum leaky = quantum(job.leaky, at), relu = quantum(job.relu, at);
@@ -278,16 +292,13 @@ CAP4D_INLINE Inputs spread16(const std::uint8_t* p) {
 #else
   const IntV all = load_int(p);
 #endif
-#if defined(CAP4D_AVX512) && defined(__AVX512VNNI__)
-  return all;
-#else
-  return {all & 0x00ff00ff, (all >> 8) & 0x00ff00ff};
-#endif
+  return split(all);
 }
 
 // What the input pixel kRow rows and kColumn columns from the upper left one adds to the outputs of each parity that it reaches.
 template <int kRow, int kColumn>
-CAP4D_INLINE const std::int8_t* last_neighbour(const LastJob& job, const std::uint8_t* pixel, const std::int8_t* weights, IntV sum[kLastPixels][kParities]) {
+CAP4D_INLINE const std::int8_t* last_neighbour(const LastJob& job, const std::uint8_t* pixel, const std::int8_t* weights,
+                                               IntV sum[kLastPixels][kParities]) {
   const std::uint8_t* input = pixel + (static_cast<std::size_t>(kRow) * (job.size / 2 + 2) + kColumn) * job.channels;
   for (int k = 0; k < job.channels; k += 4 * kGroups) {
     Inputs a[kLastPixels];
@@ -323,13 +334,17 @@ void last_tile(const LastJob& job, int x) {
     for (int p = 0; p < kLastPixels; ++p)
       for (int parity = 0; parity < kParities; ++parity) store_int(sums[p][parity] + lane, sum[p][parity]);
   }
-  for (int axis = 0; axis < 3; ++axis)
+  const std::size_t size = job.size;
+  for (int axis = 0; axis < 3; ++axis) {
+    const float scale = job.scale[axis], bias = job.bias[axis];
+    float* out = job.out + (axis * size + 2 * job.row) * size + 2 * x;
     for (int p = 0; p < kLastPixels; ++p)
       for (int parity = 0; parity < kParities; ++parity) {
         const std::int32_t* four = sums[p][parity] + axis * kGroups;
-        const std::size_t y = 2 * job.row + parity / 2, column = 2 * (x + p) + parity % 2;
-        job.out[(axis * job.size + y) * job.size + column] = static_cast<float>((four[0] + four[1]) + (four[2] + four[3])) * job.scale[axis] + job.bias[axis];
+        const std::int32_t sum = (four[0] + four[1]) + (four[2] + four[3]);
+        out[parity / 2 * size + 2 * p + parity % 2] = static_cast<float>(sum) * scale + bias;
       }
+  }
 }
 
 void last(const LastJob& job) {

@@ -89,7 +89,7 @@ struct UnetKernels {
   void (*last)(const LastJob&);
 };
 
-// The widest variant this processor runs: that of kernels(), or, beside v4, one with VNNI (CAP4D_ISA=v4 asks for none).
+// The widest variant this processor runs: that of kernels(), or that with VNNI (CAP4D_ISA=v3 or v4 asks for none).
 const UnetKernels& unet_kernels();
 
 }  // namespace cap4d

@@ -30,7 +30,9 @@ template <class T>
 class Aligned {
  public:
   Aligned() = default;
-  explicit Aligned(std::size_t count) : data_(static_cast<T*>(::operator new(count * sizeof(T), kLine))) { std::memset(data_.get(), 0, count * sizeof(T)); }
+  explicit Aligned(std::size_t count) : data_(static_cast<T*>(::operator new(count * sizeof(T), kLine))) {
+    std::memset(data_.get(), 0, count * sizeof(T));
+  }
   T* data() const { return data_.get(); }
   T& operator[](std::size_t i) const { return data_.get()[i]; }
 
@@ -58,6 +60,8 @@ struct Image8 {
   std::uint32_t outer(int y, int x) const { return static_cast<std::uint32_t>(y * line() + static_cast<std::size_t>(x) * channels); }
 };
 
+Segment segment(std::size_t offset, int bytes) { return {static_cast<std::uint32_t>(offset), static_cast<std::uint32_t>(bytes)}; }
+
 // How a layer's values become bytes of one image.
 struct Destination {
   std::uint8_t* image = nullptr;
@@ -78,15 +82,15 @@ Destination destination(std::uint8_t* image, std::span<const float> scale, std::
 // A layer of integers. Its weights lie panel by panel, in each parity by parity, in the order in which `dot` reads them.
 struct Layer {
   const std::uint8_t* input = nullptr;
-  int inputs = 0, outputs = 0, panel = 0;        // channels, padded
-  std::vector<std::uint32_t> from, to;           // [pixels] first input byte; [parities x pixels] output byte
-  std::vector<std::vector<Segment>> segments;    // of each parity
-  std::size_t taps = 0;                          // bytes of one pixel's input
+  int inputs = 0, outputs = 0, panel = 0;      // channels, padded
+  std::vector<std::uint32_t> from, to;         // [pixels] first input byte; [parities x pixels] output byte
+  std::vector<std::vector<Segment>> segments;  // of each parity
+  std::size_t taps = 0;                        // bytes of one pixel's input
   Aligned<std::int8_t> weights;
-  Aligned<std::int32_t> init;                    // [panels][parities][panel]
+  Aligned<std::int32_t> init;  // [panels][parities][panel]
   bool normalised = true;
-  Aligned<float> epsilon;                        // [outputs], where normalised
-  Aligned<float> mean, gain;                     // [outputs], computed, or fixed where not normalised
+  Aligned<float> epsilon;     // [outputs], where normalised
+  Aligned<float> mean, gain;  // [outputs], computed, or fixed where not normalised
   Destination leaky, relu;
 
   int parities() const { return static_cast<int>(segments.size()); }
@@ -123,7 +127,8 @@ void pack(Layer& layer, const WeightAt& weight, const std::vector<std::uint8_t>&
 void fill_border(const Image8& image, const std::vector<std::uint8_t>& zero) {
   for (int y = 0; y < image.side + 2; ++y)
     for (int x = 0; x < image.side + 2; ++x)
-      if (y == 0 || x == 0 || y == image.side + 1 || x == image.side + 1) std::copy(zero.begin(), zero.end(), image.bytes.data() + image.outer(y, x));
+      if (y == 0 || x == 0 || y == image.side + 1 || x == image.side + 1)
+        std::copy(zero.begin(), zero.end(), image.bytes.data() + image.outer(y, x));
 }
 
 std::vector<std::uint8_t> padded_zero(std::span<const std::uint8_t> zero, int channels) {
@@ -134,11 +139,12 @@ std::vector<std::uint8_t> padded_zero(std::span<const std::uint8_t> zero, int ch
 
 template <class T>
 void expect_size(std::span<const T> values, std::size_t count, const std::string& name) {
-  if (values.size() != count) throw std::invalid_argument(name + ": expected " + std::to_string(count) + " numbers, got " + std::to_string(values.size()));
+  if (values.size() != count)
+    throw std::invalid_argument(name + ": expected " + std::to_string(count) + " numbers, got " + std::to_string(values.size()));
 }
 
 void check(const UnetTensors& t) {
-  if (t.size < kMinSize || t.size > kMaxUnetSize || (t.size & (t.size - 1))) throw std::invalid_argument("size: expected a power of two in [8, 512], got " + std::to_string(t.size));
+  check_unet_size(t.size);
   if (t.width < 1 || t.width > kMaxUnetWidth) throw std::invalid_argument("width: expected 1 to 256, got " + std::to_string(t.width));
   const std::size_t depth = unet_depth(t.size), half = t.size / 2, width = t.width, plane = static_cast<std::size_t>(t.size) * t.size;
   if (t.down.size() != depth - 1 || t.up.size() != depth) throw std::invalid_argument("layers: expected " + std::to_string(depth) + " each way");
@@ -182,6 +188,11 @@ struct alignas(64) Phase {
 
 }  // namespace
 
+void check_unet_size(int size) {
+  if (size < kMinSize || size > kMaxUnetSize || (size & (size - 1)))
+    throw std::invalid_argument("size: expected a power of two in [8, 512], got " + std::to_string(size));
+}
+
 int unet_depth(int size) {
   int depth = -1;
   for (; size > 1; size /= 2) ++depth;
@@ -203,7 +214,7 @@ struct QuantizedUnet::Impl {
   float last_scale[3], last_bias[3];
 
   std::mutex busy;
-  mutable std::vector<Phase> phases;        // down 0, one per layer, up 0
+  std::vector<Phase> phases;                // down 0, one per layer, up 0
   std::vector<Aligned<std::int32_t>> sums;  // of each thread
   std::size_t most_sums = 0;
   const float* offsets = nullptr;
@@ -235,7 +246,8 @@ struct QuantizedUnet::Impl {
           first_weights[static_cast<std::size_t>(12 * (tap / 4) + 4 * axis + tap % 4) * channels + c] = t.weight[(c * 3 + axis) * 16 + tap];
     const auto table = [&](std::span<const float> values) {
       Aligned<float> out(static_cast<std::size_t>(3) * half * channels);
-      for (int i = 0; i < 3 * half; ++i) std::copy_n(values.data() + static_cast<std::size_t>(i) * width, width, out.data() + static_cast<std::size_t>(i) * channels);
+      for (std::size_t i = 0; i < static_cast<std::size_t>(3) * half; ++i)
+        std::copy_n(values.data() + i * width, width, out.data() + i * channels);
       return out;
     };
     rows = table(t.rows), columns = table(t.columns);
@@ -252,7 +264,7 @@ struct QuantizedUnet::Impl {
     for (int y = 0; y < side; ++y)
       for (int x = 0; x < side; ++x) layer.from.push_back(image.outer(2 * y, 2 * x)), layer.to.push_back(relu.inner(y, x));
     layer.segments.resize(1);
-    for (int line = 0; line < 4; ++line) layer.segments[0].push_back({static_cast<std::uint32_t>(line * image.line()), static_cast<std::uint32_t>(4 * image.channels)});
+    for (int line = 0; line < 4; ++line) layer.segments[0].push_back(segment(line * image.line(), 4 * image.channels));
     layer.taps = 16 * image.channels;
     const std::span<const std::uint8_t> zero = i == 1 ? t.out.leaky_zero : t.down[i - 2].out.leaky_zero;
     pack(layer, [&](int, int output, int line, int column, int channel) -> std::int8_t {
@@ -280,7 +292,7 @@ struct QuantizedUnet::Impl {
       const int below = parity / 2, right = parity % 2;
       for (int source = 0; source < sources; ++source)
         for (int line = 0; line < 2; ++line)
-          layer.segments[parity].push_back({static_cast<std::uint32_t>(source * image.plane()) + image.outer(below + line, right), static_cast<std::uint32_t>(2 * image.channels)});
+          layer.segments[parity].push_back(segment(source * image.plane() + image.outer(below + line, right), 2 * image.channels));
       for (int y = 0; y < side; ++y)
         for (int x = 0; x < side; ++x) layer.to.push_back(next.inner(2 * y + below, 2 * x + right));
     }
@@ -315,8 +327,9 @@ struct QuantizedUnet::Impl {
   // A bias makes a layer one that is not normalised.
   Layer& add_layer(const Image8& image, int outputs, std::span<const float> scale, std::span<const float> bias) {
     Layer& layer = layers.emplace_back();
-    layer.input = image.bytes.data(), layer.inputs = image.channels, layer.outputs = padded(outputs), layer.panel = panel_width(layer.outputs);
-    layer.epsilon = Aligned<float>(layer.outputs), layer.mean = Aligned<float>(layer.outputs), layer.gain = Aligned<float>(layer.outputs);
+    layer.input = image.bytes.data(), layer.inputs = image.channels;
+    layer.outputs = padded(outputs), layer.panel = panel_width(layer.outputs);
+    for (Aligned<float>* values : {&layer.epsilon, &layer.mean, &layer.gain}) *values = Aligned<float>(layer.outputs);
     std::fill_n(layer.epsilon.data(), layer.outputs, kNormEpsilon);
     layer.normalised = bias.empty();
     for (std::size_t c = 0; c < scale.size(); ++c) {
@@ -332,35 +345,41 @@ struct QuantizedUnet::Impl {
     for (int parity = 0; parity < parities; ++parity) {
       const std::size_t part = static_cast<std::size_t>(index) * parities + parity;
       const auto& segments = layer.segments[parity];
-      kernels.dot({layer.input, layer.from.data(), pixels, segments.data(), static_cast<int>(segments.size()), layer.weights.data() + part * panel * layer.taps,
-                   layer.init.data() + part * panel, panel, acc + parity * pixels * panel});
+      kernels.dot({layer.input, layer.from.data(), pixels, segments.data(), static_cast<int>(segments.size()),
+                   layer.weights.data() + part * panel * layer.taps, layer.init.data() + part * panel, panel, acc + parity * pixels * panel});
     }
     float *mean = layer.mean.data() + channel, *gain = layer.gain.data() + channel;
     if (layer.normalised) kernels.norm({acc, outputs, panel, layer.epsilon.data() + channel, mean, gain});
     // Two neighbouring panels may share cache lines: they start at different ends, so that two threads do not fight for each line.
     const std::size_t half = outputs / 2;
     for (const std::size_t begin : {index % 2 ? half : 0, index % 2 ? 0 : half})
-      kernels.requantize({acc + begin * panel, layer.to.data() + begin, half, panel, mean, gain, layer.leaky.from(channel), layer.relu.from(channel)});
+      kernels.requantize({acc + begin * panel, layer.to.data() + begin, half, panel, mean, gain, layer.leaky.from(channel),
+                          layer.relu.from(channel)});
   }
 
   void run_item(std::size_t phase, int item, std::int32_t* acc) const {
     if (phase == 0)
-      kernels.first({offsets, mask.data(), size, padded(width), item * kFirstBand, first_weights.data(), rows.data(), columns.data(), first_leaky.from(0), first_relu.from(0)});
+      kernels.first({offsets, mask.data(), size, padded(width), item * kFirstBand, first_weights.data(), rows.data(), columns.data(),
+                     first_leaky.from(0), first_relu.from(0)});
     else if (phase <= layers.size())
       run_panel(layers[phase - 1], item, acc);
     else
-      kernels.last({decoder[0].bytes.data(), decoder[0].plane(), size, padded(width), item, last_weights.data(), last_scale, last_bias, out});
+      kernels.last({decoder[0].bytes.data(), decoder[0].plane(), size, padded(width), item, last_weights.data(), last_scale, last_bias,
+                    out});
   }
 
-  void take_part(std::int32_t* acc) const {
+  void take_part(std::int32_t* acc) {
     for (std::size_t i = 0; i < phases.size(); ++i) {
       Phase& phase = phases[i];
       for (int item; (item = phase.next.fetch_add(1, std::memory_order_relaxed)) < phase.items;) {
         run_item(i, item, acc);
         phase.done.fetch_add(1, std::memory_order_release);
       }
-      for (int spins = 0; phase.done.load(std::memory_order_acquire) < phase.items; ++spins)
-        if (spins > kSpins) std::this_thread::yield();
+      for (int spins = 0; phase.done.load(std::memory_order_acquire) < phase.items;)
+        if (spins < kSpins)
+          ++spins;
+        else
+          std::this_thread::yield();
     }
   }
 };

@@ -41,9 +41,11 @@ struct UnetTensors {
   std::vector<UpTensors> up;              // 0, 1, ..
 };
 
-int unet_depth(int size);                            // how often a grid is halved: to 2 px, at most 6 times
-int unet_channels(int width, int layer);             // outputs of down `layer`
-inline constexpr int kMaxUnetWidth = 256;            // sums of 8 x width x 32 products stay below 2^31
+inline constexpr int kMaxUnetWidth = 256;  // a sum has at most 16 x 8 x width products of 255 x 127: below 2^31
+
+void check_unet_size(int size);           // throws std::invalid_argument unless it is a power of two from 8 to 512
+int unet_depth(int size);                 // how often a grid is halved: to 2 px, at most 6 times
+int unet_channels(int width, int layer);  // outputs of down `layer`
 
 class QuantizedUnet {
  public:

@@ -290,12 +290,12 @@ namespace {
 struct Contribution {  // of one Gaussian to the pixels of one block
   FloatV alpha, density, weight, next;
   Place at;
-  MaskV visible, stop;
+  MaskV visible;  // alpha >= 1/255, the pixel open, and not finished by this one
+  bool stops;     // some pixel is
 };
 
-// False where nothing of the block is visible. `visible`: alpha >= 1/255 and the pixel open; `stop`: this one would finish it.
-CAP4D_INLINE bool contribute(const Splat& s, const TileJob& job, int block, FloatV transmittance, Contribution& c) {
-  const FloatV x = load(kPixel.x) + static_cast<float>(job.x0 + block_x(block)), y = load(kPixel.y) + static_cast<float>(job.y0 + block_y(block));
+// False where nothing of the block is visible. x, y: the block's pixel centres.
+CAP4D_INLINE bool contribute(const Splat& s, FloatV x, FloatV y, FloatV transmittance, Contribution& c) {
   const FloatV exponent = exponent_at(s, x, y, c.at);
   c.visible = less_equal_in(less(splat(0.0f), transmittance), splat(kLog2AlphaMin), exponent);
   if (!any(c.visible)) return false;
@@ -303,9 +303,13 @@ CAP4D_INLINE bool contribute(const Splat& s, const TileJob& job, int block, Floa
   c.alpha = keep(c.visible, min(c.density, splat(kAlphaMax)));
   c.weight = c.alpha * transmittance;
   c.next = transmittance - c.weight;
-  c.stop = both(c.visible, less(c.next, splat(kTransmittanceMin)));
-  c.weight = keep(first_only(c.visible, c.stop), c.weight);
-  c.next = select(c.stop, -transmittance, c.next);
+  const MaskV stop = both(c.visible, less(c.next, splat(kTransmittanceMin)));
+  c.stops = any(stop);
+  if (c.stops) [[unlikely]] {
+    c.visible = first_only(c.visible, stop);
+    c.weight = keep(c.visible, c.weight);
+    c.next = select(stop, -transmittance, c.next);
+  }
   return true;
 }
 
@@ -314,33 +318,44 @@ CAP4D_INLINE bool finished(FloatV transmittance) { return !any(less(splat(0.0f),
 struct PixelGrads {  // dL/d of what a pixel accumulates: per Gaussian it adds weight * (rgb . c + constant + depth * z)
   FloatV red[kBlocks], green[kBlocks], blue[kBlocks], depth[kBlocks], constant[kBlocks];
   FloatV behind[kBlocks];  // the pixel's total of that, less what has been passed
+  FloatV x[kBlocks], y[kBlocks];  // its centre, px
 };
 
+// What the loss says of a block's pixels and what the forward pass made of them; zero outside the image and where nothing is given.
+struct PixelLanes {
+  float rgb[3][kLanes], alpha[kLanes], depth[kLanes], v_rgb[3][kLanes], v_alpha[kLanes], v_depth[kLanes];
+};
+
+CAP4D_INLINE void gather_pixels(const TileJob& job, const Image& image, const ImageGrad& v, int block, PixelLanes& lanes) {
+  lanes = {};
+  each_pixel(job, block, [&](std::size_t at, int l) {
+    for (int c = 0; c < 3; ++c) lanes.rgb[c][l] = image.rgb[3 * at + c], lanes.v_rgb[c][l] = v.rgb[3 * at + c];
+    lanes.alpha[l] = image.alpha[at];
+    if (v.alpha) lanes.v_alpha[l] = v.alpha[at];
+    if (v.depth) lanes.depth[l] = image.depth[at], lanes.v_depth[l] = v.depth[at];
+  });
+}
+
 void load_pixel_grads(const TileJob& job, const Image& image, const ImageGrad& v, PixelGrads& grads) {
-  std::memset(&grads, 0, sizeof grads);
-  const float* background = job.background;
-  const std::size_t width = job.camera->width;
-  for (int block = 0; block < kBlocks; ++block)
-    for (int l = 0; l < kLanes; ++l) {
-      const Pixel p = pixel_of(job, block, l);
-      if (!inside(job, p)) continue;
-      const std::size_t at = p.y * width + p.x;
-      const float alpha = image.alpha[at], *rgb = image.rgb + 3 * at, *v_rgb = v.rgb + 3 * at;
-      float constant = v.alpha ? v.alpha[at] : 0.0f, depth = 0.0f;
-      if (v.depth && alpha > 0) {  // depth = accumulated / alpha
-        depth = v.depth[at] / alpha;
-        constant -= depth * image.depth[at];
-      }
-      float foreground = 0.0f;  // rgb = accumulated + (1 - alpha) background
-      for (int c = 0; c < 3; ++c) {
-        constant -= v_rgb[c] * background[c];
-        foreground += v_rgb[c] * (rgb[c] - background[c]);
-      }
-      foreground += constant * alpha + depth * image.depth[at] * alpha;
-      for (int c = 0; c < 3; ++c) foreground += v_rgb[c] * background[c] * alpha;
-      grads.red[block][l] = v_rgb[0], grads.green[block][l] = v_rgb[1], grads.blue[block][l] = v_rgb[2];
-      grads.depth[block][l] = depth, grads.constant[block][l] = constant, grads.behind[block][l] = foreground;
+  for (int block = 0; block < kBlocks; ++block) {
+    PixelLanes lanes;
+    gather_pixels(job, image, v, block, lanes);
+    const FloatV alpha = load(lanes.alpha), image_depth = load(lanes.depth);
+    // depth = accumulated / alpha
+    const FloatV depth = keep(less(splat(0.0f), alpha), load(lanes.v_depth) / alpha);
+    FloatV constant = load(lanes.v_alpha) - depth * image_depth, foreground = FloatV{}, v_rgb[3];
+    for (int c = 0; c < 3; ++c) {  // rgb = accumulated + (1 - alpha) background
+      const float background = job.background[c];
+      v_rgb[c] = load(lanes.v_rgb[c]);
+      constant -= v_rgb[c] * background;
+      foreground += v_rgb[c] * (load(lanes.rgb[c]) - background + background * alpha);
     }
+    foreground += constant * alpha + depth * image_depth * alpha;
+    grads.red[block] = v_rgb[0], grads.green[block] = v_rgb[1], grads.blue[block] = v_rgb[2];
+    grads.depth[block] = depth, grads.constant[block] = constant, grads.behind[block] = foreground;
+    grads.x[block] = load(kPixel.x) + static_cast<float>(job.x0 + block_x(block));
+    grads.y[block] = load(kPixel.y) + static_cast<float>(job.y0 + block_y(block));
+  }
 }
 
 template <bool kDepth>
@@ -357,13 +372,13 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
     for (; todo; todo &= todo - 1) {
       const int block = __builtin_ctzll(todo);
       Contribution c;
-      if (!contribute(s, job, block, transmittance[block], c)) continue;
+      if (!contribute(s, grads.x[block], grads.y[block], transmittance[block], c)) continue;
       touched = true;
       FloatV value = grads.red[block] * s.red + grads.green[block] * s.green + grads.blue[block] * s.blue + grads.constant[block];
       if constexpr (kDepth) value += grads.depth[block] * s.depth;
       const FloatV own = c.weight * value, behind = grads.behind[block] - own;
       // dL/d(ln alpha) = weight * value - alpha / (1 - alpha) * behind, where this one is drawn and not clamped.
-      const MaskV moves = both(first_only(c.visible, c.stop), less(c.density, splat(kAlphaMax)));
+      const MaskV moves = both(c.visible, less(c.density, splat(kAlphaMax)));
       const FloatV ds = keep(moves, own - behind * (c.alpha * reciprocal(1.0f - c.alpha)));
       v_red += c.weight * grads.red[block];
       v_green += c.weight * grads.green[block];
@@ -378,7 +393,7 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
       v_suu += su * c.at.u;
       grads.behind[block] = behind;
       transmittance[block] = c.next;
-      if (any(c.stop) && finished(c.next)) open &= ~(BlockSet{1} << block);
+      if (c.stops && finished(c.next)) open &= ~(BlockSet{1} << block);
     }
     // Straight into memory: read back in wider pieces it would wait for the stores.
     float* out = &pair_grads[slots[i]].red;

@@ -140,7 +140,9 @@ void Splatter::place_frames(const float* vertices, int threads) {
 }
 
 void Splatter::order(const double* viewmat, const float* vertices, int threads, std::uint32_t* order) {
+  Stopwatch watch;
   place_frames(vertices, threads);
+  rendered_.seconds.frames = watch.lap();
   const double forward[3] = {viewmat[8], viewmat[9], viewmat[10]}, offset = viewmat[11];
   sort_depths(packed_.count, order, threads, [&](std::size_t i) {
     const PackedFloats* mean = &packed_.shape[i / kPack * kPackedFields + kPackedMean];
@@ -151,6 +153,7 @@ void Splatter::order(const double* viewmat, const float* vertices, int threads, 
       depth += forward[r] * (f ? f->turn[3 * r] * at[0] + f->turn[3 * r + 1] * at[1] + f->turn[3 * r + 2] * at[2] + f->centre[r] : at[r]);
     return static_cast<float>(depth);
   });
+  rendered_.seconds.sort = watch.lap();
 }
 
 void Splatter::prepare(const View& view, int threads) {

@@ -57,7 +57,7 @@ def test_instruction_sets_give_the_same_bits(
 ) -> None:
     results = results_of(isa, tmp_path)
     assert base_results["isa"] == "base"
-    if results["isa"] != isa:
+    if isa != "vnni" and results["isa"] != isa:  # vnni asks for the widest there is
         pytest.skip(f"this processor does not run {isa}, but {results['isa']}")
     for size, width in SHAPES:
         key = f"{size}_{width}"

@@ -70,7 +70,7 @@ HARD_BOUND_FAR = 0.1  # 10 km away posed means have steps of half a millimetre, 
 # Rotations near the identity and half turns, to matrix, quaternion, vector and back, in steps of the number.
 ROTATION = 25
 
-# The deformation network in 8-bit integers against float32, mm. Random networks that answer 1 mm RMS an axis;
-# trained ones, which are smoother, come five times nearer (bench_deformer).
+# The deformation network in 8-bit integers against float32, mm. Of random networks that answer 1 mm RMS per
+# axis; trained ones come several times nearer (bench_deformer).
 INT8_RMS_MM = 0.08
 INT8_MOST_MM = 0.4

@@ -23,8 +23,10 @@ COMMANDS = (
     ["rig", "show"],
     ["track"],
     ["fit"],
+    ["optimize"],
     ["render"],
     ["inspect"],
+    ["bench"],
 )
 
 

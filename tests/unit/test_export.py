@@ -115,7 +115,11 @@ def test_the_player_poses_what_was_fitted(tmp_path):
     np.testing.assert_allclose(gaussians.means, posed.means.numpy(), atol=2e-6)
     np.testing.assert_allclose(gaussians.scales, posed.scales.numpy(), rtol=1e-4, atol=1e-8)
     np.testing.assert_allclose(gaussians.opacities, posed.opacities.numpy(), atol=1e-6)
-    assert np.abs(read_bundle(path).deform_neutral).max() > 1e-4
+    bundle = read_bundle(path)
+    assert np.abs(bundle.deform_neutral).max() > 1e-4
+    assert bundle.tiers == ("full", "int8", "linear", "off")
+    rms, worst = bundle.tier_errors["full"]
+    assert 0 < rms <= worst < 1e-4, "float32 against float64, mm"
 
 
 def test_an_export_that_differs_is_refused(tmp_path, monkeypatch):

@@ -82,6 +82,11 @@ def test_what_onnxruntime_cannot_load_is_a_data_error(data: bytes, capfd: pytest
     assert capfd.readouterr() == ("", ""), "one line is the command line's to print"
 
 
+def test_tensors_that_are_no_network_are_a_data_error() -> None:
+    with pytest.raises(DataError, match=r"here: network: expected one that runs, found down0\.weight"):
+        Deformer({"weight": np.zeros(3, np.int8)}, size=SIZE, source="here")
+
+
 def test_an_operator_that_cannot_run_is_a_data_error(model: bytes, capfd: pytest.CaptureFixture) -> None:
     import onnx
 

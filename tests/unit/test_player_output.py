@@ -240,6 +240,14 @@ def test_the_clip_plays_once_unless_told_otherwise(avatar: Avatar) -> None:
     assert frame_count(avatar.idle, None, 48.0) == 24 and frame_count(avatar.idle, 100, 24.0) == 100
 
 
+def test_a_pipeline_draws_the_same_pictures(avatar: Avatar) -> None:
+    path = camera_path("static", avatar.camera, np.zeros(3), fps=24, size=(16, 16))
+    alone, ahead = (
+        list(render_clip(avatar, avatar.idle, path, frames=7, pipelined=p)) for p in (False, True)
+    )
+    assert len(alone) == 7 and all(np.array_equal(a, b) for a, b in zip(alone, ahead, strict=True))
+
+
 def test_render_to_writes_what_it_drew_and_its_times(avatar: Avatar, tmp_path: Path) -> None:
     output = Output(tmp_path / "a.mp4", frames=9, size=(48, 32), stats=tmp_path / "s.json")
     stats = render_to(avatar, avatar.idle, "orbit", output)
