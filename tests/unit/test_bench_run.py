@@ -187,11 +187,12 @@ def test_a_child_that_fails_says_why() -> None:
 def test_what_is_not_installed_is_said_and_not_made_up(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setitem(sys.modules, "nerfacc", None)
+    for name in ("gsplat", "nerfacc"):
+        monkeypatch.setitem(sys.modules, name, None)
     scene = SceneSource().load("head_30k", count=30)
     found, missing = peers.find_peers(scene, Settings(quick=True))
     assert list(found) == ["NumPy, float32, tile by tile"]
-    assert len(missing) == 1 and "needs the package nerfacc" in missing[0]
+    assert len(missing) == 1 and "needs the package" in missing[0]
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     report = {"not_measured": [], "peers": {"scenes": []}}
