@@ -1,7 +1,7 @@
 """What the window shows, into an mp4, in a thread that the window never waits for.
 
-`Recorder.add` copies a picture into a bounded queue, or drops it when the encoder is behind: the video then shows
-the picture before it a little longer. Its rate is constant; the times of the pictures decide who is seen when.
+`Recorder.add` copies a picture into a bounded queue, or drops it when the encoder is behind: the video then
+shows the picture before it a little longer. Its rate is constant; real times decide which is seen when.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Recorder:
         size: (width, height) px of the video. Pictures of another size are fitted in, on black.
         fps: Of the video.
         audio: Its sound, or the .wav of it.
-        sound_at: Where the sound is as a picture is added, for sound that is paused, sought or repeated. None: it
-            starts with the first picture and goes on.
+        sound_at: Where the sound is as a picture is added, for sound that is paused, sought or repeated.
+            None: it starts with the first picture and goes on.
         start: Whether to start the thread (tests do not).
     Raises:
         ArgumentError: No such file can be written, or the size or rate is out of range.

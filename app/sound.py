@@ -1,7 +1,7 @@
 """A sound that plays beside the pictures, and whose clock rules them.
 
-`SoundPlayer.position` is where the sound is heard now. A device plays it (through miniaudio, which brings all it needs
-along: `pip install "cap4d[live]"`); without the package or without a device time goes on in silence.
+`SoundPlayer.position` is where the sound is heard now. A device plays it (through miniaudio, which brings
+all it needs along: `pip install "cap4d[live]"`); without the package or a device time goes on in silence.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ class SoundPlayer:
             return self._start + self._speed * self._heard.heard(self._clock())
 
     def heard(self) -> float | None:
-        """Where the sound itself is, for `Recorder`'s `sound_at`; None where it is paused or not at its own speed."""
+        """Where the sound itself is, for `Recorder`'s `sound_at`; None: paused, or not at its own speed."""
         if not self._playing or self._speed != 1:
             return None
         at = self.position()

@@ -1,7 +1,8 @@
-"""Where a sound is heard right now, from the moments at which the device asks for more of it. Pure: callers pass times.
+"""Where a sound is heard right now, from the moments at which the device asks for more of it.
 
-A device takes samples in gulps, and they are heard a little later. Between gulps time goes on with the machine's
-clock; the device's own clock, which is never quite as fast, is followed by a share of each gulp's difference.
+A device takes samples in gulps, and they are heard a little later. Between gulps time goes on with the
+machine's clock; the device's own, never quite as fast, is followed by a share of each gulp's difference.
+Pure: callers pass times.
 """
 
 from __future__ import annotations

@@ -42,8 +42,8 @@ class Soundtrack:
 
         Args:
             pictures: How many there are with this one.
-            sound_at: Where the sound is at this picture, s; the sound goes on without a gap while that is within
-                `SLACK_SECONDS` of it. None: where the picture is in the video; NaN: silence.
+            sound_at: Where the sound is at this picture, s; the sound goes on without a gap while that is
+                within `SLACK_SECONDS` of it. None: where the picture is in the video; NaN: silence.
         """
         count = round(pictures * self.sound.rate / self.fps) - self._written
         if sound_at is None:

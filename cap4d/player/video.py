@@ -72,8 +72,8 @@ class VideoWriter:
         """Appends uint8[H, W, 3 | 4]; a video drops alpha and pads odd sizes by repeating an edge.
 
         Args:
-            sound_at: Where the sound is at this picture, s; None: where this picture is in the video; NaN: the
-                picture is silent. See `Soundtrack.write`.
+            sound_at: Where the sound is at this picture, s; None: where this picture is in the video; NaN:
+                the picture is silent. See `Soundtrack.write`.
         """
         if self.path.suffix == ".png":
             self._write_png(image)

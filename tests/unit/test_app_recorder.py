@@ -1,4 +1,4 @@
-"""Recording: pictures at any time and of any size become a video of constant rate, or an error, never a wait."""
+"""Recording: pictures at any time and of any size become a video of constant rate, or an error."""
 
 from __future__ import annotations
 

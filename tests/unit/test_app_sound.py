@@ -1,4 +1,4 @@
-"""The audio clock, and the player that hands samples to a device: a false one, and miniaudio's that plays to nobody."""
+"""The audio clock, and the player with a false device and with one that plays to nobody."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def test_sound_follows_where_it_is_said_to_be(tmp_path: Path) -> None:
     fps, sound = 20, Sound(click(1.5), 48000)
     drifting = 0.003 * np.sin(np.arange(60))
     with VideoWriter(tmp_path / "a.mp4", fps=fps, sound=sound) as video:
-        for k in range(20):
+        for _ in range(20):
             video.write(shade(False), sound_at=math.nan)
         for k in range(20, 40):
             video.write(shade(k == 30), sound_at=1.0 + (k - 20) / fps + drifting[k])
