@@ -1,6 +1,6 @@
 """Colours for values: equal steps look equal, and lighter is more.
 
-Every 16th of the 256 colours of matplotlib's `viridis` and `magma` (van der Walt and Smith, CC0); between them the
+Every 16th of the 256 colours of matplotlib's `viridis` and `magma` (van der Walt and Smith, CC0); in between
 colours are linear, which differs from the tables by 0.02 at most.
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 from cap4d.app.overlays.legend import Legend
 from imgui_bundle import imgui
@@ -38,7 +39,7 @@ def _bar(legend: Legend) -> None:
     draw, corner = imgui.get_window_draw_list(), imgui.get_cursor_screen_pos()
     packed = [imgui.get_color_u32(imgui.ImVec4(*(c / 255 for c in color), 1)) for color in legend.colors]
     width = BAR[0] / (len(packed) - 1)
-    for k, (left, right) in enumerate(zip(packed[:-1], packed[1:], strict=True)):
+    for k, (left, right) in enumerate(pairwise(packed)):
         low = imgui.ImVec2(corner.x + k * width, corner.y)
         high = imgui.ImVec2(corner.x + (k + 1) * width, corner.y + BAR[1])
         draw.add_rect_filled_multi_color(low, high, left, right, right, left)

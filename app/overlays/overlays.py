@@ -48,7 +48,9 @@ class Overlays:
         self.ctx, self.avatar = ctx, avatar
         self.shown: set[Overlay] = set()
         self.part = Part.ALL
-        self.limits_mm = dict.fromkeys(Part, 0.0)  # what the deformation's last colour stands for; it only grows
+        self.limits_mm = dict.fromkeys(
+            Part, 0.0
+        )  # what the deformation's last colour stands for; it only grows
         self._colors = color_map("viridis")
         self._surface: SurfacePass | None = None
         self._density: DensityOverlay | None = None

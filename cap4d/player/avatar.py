@@ -122,7 +122,7 @@ class Avatar:
         return out
 
     def deformation(self) -> np.ndarray:
-        """float32[G, 3] m, OpenCV axes: how far the deformer moved the grid's vertices in the last frame posed.
+        """float32[G, 3] m, OpenCV axes: how far the deformer moved the grid's vertices in the last frame.
 
         Worked out when asked for; `bundle.deform_neutral` is the part of it that is there without expression.
         """

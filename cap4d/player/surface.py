@@ -37,7 +37,9 @@ class Surface:
             neutral = neutral + subject.pose_offset
         if subject.pose_basis is not None:
             basis.append(subject.pose_basis)
-        self._pixels = np.ascontiguousarray(grid.pixels[:, 0].astype(np.int32) * grid.size + grid.pixels[:, 1])
+        self._pixels = np.ascontiguousarray(
+            grid.pixels[:, 0].astype(np.int32) * grid.size + grid.pixels[:, 1]
+        )
         self._core = _core.GridSurface(
             _floats(neutral),
             _floats(np.concatenate(basis)),
@@ -78,7 +80,7 @@ class Surface:
             self._core.deform(out, self._answer, self.threads)
 
     def deformation(self) -> np.ndarray:
-        """float32[G, 3] m, head frame, OpenCV axes: what the network, or what stands in for it, moved last frame."""
+        """float32[G, 3] m, head frame, OpenCV axes: what the network or its stand-in moved in the last frame."""
         moved = self._neutral_answer.copy()
         where = self._deformable
         if self._answer is not None:

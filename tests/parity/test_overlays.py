@@ -55,11 +55,11 @@ def test_triangles_are_where_the_camera_projects_them(samples, found, vertices):
     for index in lone_faces():
         corners, covered = corners_of(index, vertices), found[f"face {index} {samples}"].astype(float)
         covered /= covered.max()
-        assert np.abs(middle(covered) - corners.mean(0)).max() < (0.1 if samples else 0.25)
+        assert np.abs(middle(covered) - corners.mean(0)).max() < (0.1 if samples else 0.4)  # rows on an edge
         area = 0.5 * abs(np.linalg.det(corners[1:] - corners[0]))
-        assert covered.sum() == pytest.approx(area, rel=0.04, abs=3)
+        assert covered.sum() == pytest.approx(area, rel=0.03 if samples else 0.07)
         out = (corners - corners.mean(0)) / np.linalg.norm(corners - corners.mean(0), axis=1)[:, None]
-        for inside, beyond in zip(corners - 1.5 * out, corners + 1.0 * out, strict=True):
+        for inside, beyond in zip(corners - (1.5 if samples else 3) * out, corners + 1.0 * out, strict=True):
             assert covered[int(inside[1]), int(inside[0])] > 0.2
             assert covered[int(beyond[1]), int(beyond[0])] == 0
 
