@@ -32,7 +32,7 @@ def ticks(limit: float) -> tuple[tuple[float, str], ...]:
 
 
 def rounded_up(value: float) -> float:
-    """The next of ... 0.8, 1, 1.2, 1.6, 2, 3, 4, 6, 8, 10, ...: a limit that stays while values move a little."""
+    """The next of `STEPS` times a power of ten: a limit that stays while values move a little."""
     if not value > 0:
         return STEPS[0]
     power = 10.0 ** math.floor(math.log10(value))
