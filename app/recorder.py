@@ -33,6 +33,7 @@ FAST_FROM = (
 QUEUED_BYTES = 96 << 20  # of pictures that wait for the encoder
 QUEUED = (2, 12)  # that may wait whatever their size, and at most
 MAX_GAP = 60.0  # s without a picture that the video shows; longer ones are cut to this
+HEARD_ON = 0.5  # s without a picture in which sound goes on; a window that is paused shows no new ones
 NICENESS = 10  # of the encoder, where threads can be nice: the window comes first
 
 SoundAt = Callable[[], float | None]
@@ -229,7 +230,9 @@ class Recorder:
 
     def _write_one(self, video: VideoWriter, shot: _Shot, later: float) -> None:
         at = shot.sound_at
-        video.write(shot.image, sound_at=None if at is None else at + later)
+        if at is not None:
+            at = at + later if later <= HEARD_ON else math.nan
+        video.write(shot.image, sound_at=at)
         self.frames += 1
 
 

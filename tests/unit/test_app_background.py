@@ -12,7 +12,9 @@ import pytest
 from cap4d.app import background as background_module
 from cap4d.app.background import CHECK_PX, Backdrop, Checkerboard, Picture, cover
 from cap4d.app.gl_context import GlUnavailableError, headless_context
+from cap4d.app.readback import Readback
 from cap4d.app.renderers import CpuRenderer, GlRenderer
+from cap4d.app.screenshot import save_screenshot, straight
 from tiny_bundle import tiny_bundle
 
 from cap4d.errors import ArgumentError, DataError
@@ -171,6 +173,24 @@ def test_images_of_odd_widths_and_one_pixel(ctx) -> None:
         == [[[77] * 3] * 48] * 48
     )
     assert laid(ctx, clear(1, 1), Picture(np.full((1, 1, 3), 9, np.uint8))).tolist() == [[[9, 9, 9, 255]]]
+
+
+def test_a_screenshot_without_a_background_has_straight_alpha(ctx, tmp_path: Path) -> None:
+    avatar = Avatar(tiny_bundle(network=False))
+    frame, camera = avatar.idle.frame(3), avatar.camera.resized(70, 50)
+    expected = avatar.splat(avatar.move(frame), camera).astype(int)
+    for renderer in (GlRenderer(ctx, avatar), CpuRenderer(ctx, avatar, background=None)):
+        picture, readback = renderer.texture(frame, camera), Readback(ctx)
+        target = ctx.simple_framebuffer((70, 50))
+        target.use()
+        Backdrop(ctx).draw(picture, None, upright=True)
+        readback.push(target, (70, 50), 0.0)
+        path = save_screenshot(tmp_path, straight(readback.flush().image), name=renderer.name)
+        with av.open(str(path)) as file:
+            found = next(file.decode(video=0)).to_ndarray(format="rgba").astype(int)
+        assert np.abs(found[..., 3] - expected[..., 3]).max() <= 2
+        solid = expected[..., 3] > 100  # a level of a premultiplied colour is more of a faint one
+        assert np.abs(found - expected)[solid].max() <= 4 and (found[..., 3] == 0).any()
 
 
 def test_both_backends_give_premultiplied_pictures(ctx) -> None:

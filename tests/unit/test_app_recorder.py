@@ -130,6 +130,19 @@ def test_sound_goes_with_the_pictures(tmp_path: Path) -> None:
     assert loud[0] == pytest.approx(0.3, abs=2e-3) and loud[-1] < 0.32
 
 
+def test_a_gap_in_the_pictures_is_a_pause_of_the_sound(tmp_path: Path) -> None:
+    loud = Sound(np.full((96000, 1), 9000, np.int16), 48000)
+    recorder = Recorder(tmp_path / "a.mp4", (32, 32), 10, loud, sound_at=lambda: 0.0, start=False)
+    recorder.add(grey(0), 0.0)
+    recorder.add(grey(0), 1.9)
+    recorder._thread.start()
+    recorder.close()
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        samples = np.concatenate([frame.to_ndarray()[0] for frame in file.decode(audio=0)])
+    tenths = np.abs(samples[: 48000 * 2].reshape(20, -1)).mean(1) > 0.1
+    assert tenths.tolist() == [True] * 6 + [False] * 13 + [True]
+
+
 def test_there_is_no_file_before_the_end_and_none_without_pictures(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "a.mp4", (32, 32), 10)
     assert not (tmp_path / "a.mp4").exists()
