@@ -75,6 +75,8 @@ def draw_on_gl(output: str) -> None:
             found[f"face {index} {samples}"] = surface(grid.faces[index : index + 1], samples)[..., 3]
     found["mesh"] = surface(grid.faces, 0, "overlay_mesh")
     found["lone mesh"] = surface(grid.faces[lone_faces()[3]][None], 0, "overlay_mesh")
+    inside_out = grid.faces[lone_faces()[3]][None, ::-1]
+    found["inside out"] = surface(np.ascontiguousarray(inside_out), 0, "overlay_mesh")
     found["outline"] = surface(grid.faces, 0)[..., 3]
 
     for renderer in (GlRenderer(ctx, player), CpuRenderer(ctx, player, background=None)):

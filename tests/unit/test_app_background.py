@@ -68,6 +68,17 @@ def test_large_images_are_kept_smaller(tmp_path: Path, monkeypatch: pytest.Monke
     assert found.shape == (16, 32, 3) and found[8, 4].tolist() == pytest.approx([250, 0, 0], abs=3)
 
 
+def test_photos_are_turned_upright(tmp_path: Path) -> None:
+    """As their EXIF says: red was on the left before."""
+    photo = save_with_av(tmp_path / "a.jpg", halves(), "mjpeg", "yuvj444p").read_bytes()
+    for orientation, red in ((1, (16, 8)), (3, (16, 56)), (6, (8, 16)), (8, (56, 16))):
+        entry = struct.pack(">HHHIHH", 1, 0x112, 3, 1, orientation, 0)
+        exif = b"Exif\0\0MM\0*\0\0\0\x08" + entry + bytes(4)
+        segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
+        (tmp_path / "b.jpg").write_bytes(photo[:2] + segment + photo[2:])
+        assert Picture.load(tmp_path / "b.jpg").pixels[red].argmax() == 0
+
+
 def bomb(side: int) -> bytes:
     """A PNG of `side`^2 black pixels."""
 
