@@ -21,6 +21,7 @@ class Renderer(Protocol):
     """Draws one avatar."""
 
     name: str
+    avatar: Avatar
 
     def texture(self, frame: Frame, camera: Camera) -> moderngl.Texture:
         """The picture as a texture: premultiplied sRGB, row 0 on top. Valid until the next call."""
