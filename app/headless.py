@@ -36,7 +36,8 @@ def play_headless(path: Path, options: Options) -> None:
     if options.pipeline and backend != "cpu":
         raise ArgumentError(f"pipeline: expected the cpu backend, got {backend}")
     out = options.out or f"{path.stem}.mp4"
-    output = Output(out, frames=options.frames, size=options.size or PICTURE, stats=options.stats)
+    size = options.size or PICTURE
+    output = Output(out, frames=options.frames, size=size, stats=options.stats, audio=options.audio)
     pipelined = options.pipeline
     stats = render_to(avatar, clip, options.camera, output, draw=draw, backend=backend, pipelined=pipelined)
     log.info("%s: %d frames, %.1f fps (%s)", out, stats["frames"], stats["fps"], backend)

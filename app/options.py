@@ -16,6 +16,7 @@ EXAMPLES = """examples:
   cap4d-view me.cap4d --drive speech.npy --template neutral.npy --fps 30
   cap4d-view me.cap4d --headless --frames 120 --out out.mp4 --stats stats.json
   cap4d-view me.cap4d --headless --camera orbit --out frame_%04d.png
+  cap4d-view me.cap4d --drive speech.npy --audio speech.wav --out speech.mp4
 
 keys: space pause, left/right step a frame, r reset the camera, h hide the panels, F1 all keys, q quit
 """
@@ -44,6 +45,7 @@ class Options:
     frames: int | None
     out: str | None
     camera: str
+    audio: Path | None
     stats: Path | None
 
 
@@ -83,6 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add("--out", metavar="FILE", help="out.mp4, frame_%%04d.png or one.png (headless: default <avatar>.mp4)")
     add("--camera", default="static", metavar="static|orbit|FILE", help="camera path (default: static)")
+    add("--audio", type=Path, metavar="FILE.wav", help="sound that plays with the source, or of out.mp4")
     add("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
     return parser
 
