@@ -1,16 +1,16 @@
 """Apple's 52 blendshapes, and how a rig shows them.
 
-A rig that names its expressions after them shows them exactly; what it lacks is left out. FLAME names none: there
-they are solved for, see arkit_flame.py. Left and right are the person's own.
+A rig that names its expressions after them shows them exactly; what it lacks is left out. FLAME names none:
+there they are solved for, see arkit_flame.py. Left and right are the person's own.
 
 | rig | how | of the 52 it lacks |
 |---|---|---|
 | `builtin` | by name | none |
 | `ict_facekit_light` | by name; `browInnerUp` and `cheekPuff` drive both sides' shapes | `tongueOut` |
-| FLAME, any edition | ridge least squares on its own expressions, and `jaw_rot` where it has a jaw | `tongueOut` |
+| FLAME | solved on its own expressions, and `jaw_rot` where it has a jaw | `tongueOut` |
 
-Gaze is not a blendshape of any rig: eye joints turn by the eight `eyeLook` weights (whose shapes only move the
-lids).
+Gaze is not a blendshape of any rig: eye joints turn by the eight `eyeLook` weights (whose shapes only move
+the lids).
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ NAMES = (
 """Apple's order (`ARFaceAnchor.BlendShapeLocation`), which is also that of Live Link Face's packets."""
 COLUMN = {name: column for column, name in enumerate(NAMES)}
 
-# How far an eye turns at a weight of 1. Measured on the app's own recordings, which hold the weights beside the
-# angles: 35.0 degrees inwards, outwards and down, 25.1 up.
+# How far an eye turns at a weight of 1. Measured on the app's own recordings, which hold the weights beside
+# the angles: 35.0 degrees inwards, outwards and down, 25.1 up.
 LOOK_FAR, LOOK_UP = np.float32(np.radians(35.0)), np.float32(np.radians(25.0))
 
 
@@ -75,7 +75,9 @@ def arkit_map(bundle: Bundle) -> ArkitMap:
     by_name = _by_name(bundle.rig_name, bundle.subject.expression_names)
     if by_name is not None:
         return by_name
-    raise ArgumentError(f"arkit: expected an avatar on a rig with ARKit's expressions or on FLAME, got {bundle.rig_name}")
+    raise ArgumentError(
+        f"arkit: expected an avatar on a rig with ARKit's expressions or on FLAME, got {bundle.rig_name}"
+    )
 
 
 def gaze_of(weights: np.ndarray) -> np.ndarray:
@@ -91,7 +93,7 @@ def gaze_of(weights: np.ndarray) -> np.ndarray:
 
 
 def look_weights(eye_rot: np.ndarray) -> np.ndarray:
-    """float32[52] the `eyeLook` weights that turn both eyes by `eye_rot` [3] rad: the inverse of `gaze_of`."""
+    """float32[52] the `eyeLook` weights that turn both eyes by `eye_rot` [3] rad: `gaze_of`'s inverse."""
     weights = np.zeros(len(NAMES), np.float32)
     pitch, yaw = float(eye_rot[0]), float(eye_rot[1])
     vertical = ("Down", pitch / LOOK_FAR) if pitch > 0 else ("Up", -pitch / LOOK_UP)
@@ -104,7 +106,7 @@ def look_weights(eye_rot: np.ndarray) -> np.ndarray:
 
 
 def apple_name(name: str) -> str | None:
-    """Apple's name for a rig's `eyeBlink_L`, `browInnerUp_R` (a half of one of Apple's) or `jawOpen`; or None."""
+    """Apple's name of a rig's `eyeBlink_L`, `jawOpen` or `browInnerUp_R` (a half of Apple's), or None."""
     if name in COLUMN:
         return name
     stem, _, side = name.rpartition("_")
@@ -121,4 +123,6 @@ def _by_name(rig_name: str, names: tuple[str, ...]) -> ArkitMap | None:
     if not expr.any():
         return None
     missing = tuple(name for name, column in zip(NAMES, expr.T, strict=True) if not column.any())
-    return ArkitMap(rig_name, expr, np.zeros((3, len(NAMES)), np.float32), missing, np.zeros(len(NAMES), np.float32))
+    return ArkitMap(
+        rig_name, expr, np.zeros((3, len(NAMES)), np.float32), missing, np.zeros(len(NAMES), np.float32)
+    )

@@ -28,7 +28,9 @@ def expression_ranges(bundle: Bundle) -> np.ndarray:
 
 
 def expression_groups(bundle: Bundle) -> dict[str, tuple[int, ...]]:
-    """Group -> the numbers of its expressions, by name: left before right. Each is in one group; no empty ones."""
+    """Group -> the numbers of its expressions, by name: left before right. Each is in one group; no empty
+    ones.
+    """
     names = expression_names(bundle)
     members: dict[str, list[int]] = {group: [] for group in (*GROUPS, OTHER)}
     for number, name in enumerate(names):
