@@ -106,6 +106,15 @@ class Backdrop:
         picture.use(0)
         self.array.render(moderngl.TRIANGLES, vertices=3)
 
+    def over(self, picture: moderngl.Texture, *, upright: bool = False) -> None:
+        """Lays a premultiplied picture over what the framebuffer in use holds."""
+        self.program["flip"] = (1, -1) if upright else (1, 1)
+        self._set(None, picture.size)
+        picture.use(0)
+        self.ctx.enable_only(moderngl.BLEND)
+        self.ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        self.array.render(moderngl.TRIANGLES, vertices=3)
+
     def _set(self, background: Background, size: tuple[int, int]) -> None:
         kinds = {type(None): 0, Checkerboard: 2, Picture: 3}
         self.program["kind"] = kinds.get(type(background), 1)
@@ -120,8 +129,6 @@ class Backdrop:
 
     def _texture(self, picture: Picture) -> moderngl.Texture:
         if self._image is None or self._image[0] is not picture:
-            if self._image is not None:
-                self._image[1].release()
             height, width = picture.pixels.shape[:2]
             texture = self.ctx.texture((width, height), 3, np.ascontiguousarray(picture.pixels), alignment=1)
             texture.build_mipmaps()

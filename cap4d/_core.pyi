@@ -147,7 +147,7 @@ class Splatter:
         threads: int = 0,
         premultiplied: bool = False,
     ) -> None:
-        """Into out uint8[H, W, 4]: on a background with alpha 255, or else with straight alpha unless asked."""
+        """Into out uint8[H, W, 4]: on a background with alpha 255, else straight unless asked otherwise."""
     def count(self, out: NDArray[np.uint16], threads: int = 0) -> None:
         """Into out uint16[H, W]: how many Gaussians each pixel of the last picture takes, hidden ones too."""
     def render(

@@ -121,6 +121,13 @@ class Avatar:
         self._pose(out, expr, eye_rot=eye_rot, neck_rot=neck_rot, jaw_rot=jaw_rot)
         return out
 
+    def deformation(self) -> np.ndarray:
+        """float32[G, 3] m, OpenCV axes: how far the deformer moved the grid's vertices in the last frame.
+
+        Worked out when asked for; `bundle.deform_neutral` is the part of it that is there without expression.
+        """
+        return self.surface.deformation()
+
     def move(self, frame: Frame) -> np.ndarray:
         """`vertices` of a driven frame, in the avatar's own memory: the call after the next overwrites it."""
         self.check_rig(frame.rig_name)
