@@ -6,18 +6,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
+from cap4d.bundle.bundle import Bundle
+from cap4d.drive.expressions import expression_groups, expression_names, expression_ranges
 
-GROUPS = {
-    "Brows": ("brow",),
-    "Eyes": ("eye", "blink", "gaze"),
-    "Cheeks and nose": ("cheek", "nose"),
-    "Jaw": ("jaw",),
-    "Mouth": ("mouth", "lip"),
-    "Tongue": ("tongue",),
-}
-"""Group -> the words that a name of it begins with, or holds."""
-OTHER = "Expressions"
 SIDES = {"L": "left", "R": "right", "Left": "left", "Right": "right"}
 
 
@@ -29,7 +20,7 @@ class Expression:
         index: Where it stands in the vector.
         name: As the rig calls it.
         label: For people: `Mouth smile left`.
-        group: One of `GROUPS`, or `OTHER`.
+        group: A part of the face: `Brows`; see `expression_groups`.
         low, high: Its useful values.
     """
 
@@ -41,19 +32,14 @@ class Expression:
     high: float
 
 
-def listed(names: Sequence[str], ranges: np.ndarray) -> list[Expression]:
-    """All expressions of a rig, group after group.
-
-    Args:
-        names: In the order of the vector.
-        ranges: float32[E, 2]; an empty or upside-down range becomes one of width 1.
-    """
-    order = [*GROUPS, OTHER]
-    found = []
-    for index, (name, (low, high)) in enumerate(zip(names, ranges, strict=True)):
-        high = high if high > low else low + 1
-        found.append(Expression(index, name, label(name), group_of(name), float(low), float(high)))
-    return sorted(found, key=lambda e: (order.index(e.group), e.index))
+def listed(bundle: Bundle) -> list[Expression]:
+    """All expressions of an avatar, group after group; an empty range becomes one of width 1."""
+    names, ranges = expression_names(bundle), expression_ranges(bundle)
+    return [
+        _expression(index, names[index], group, *(float(x) for x in ranges[index]))
+        for group, members in expression_groups(bundle).items()
+        for index in members
+    ]
 
 
 def matching(expressions: Sequence[Expression], words: str) -> list[Expression]:
@@ -70,16 +56,6 @@ def grouped(expressions: Sequence[Expression]) -> dict[str, list[Expression]]:
     return groups
 
 
-def group_of(name: str) -> str:
-    """The part of the face that a name speaks of."""
-    lower = name.lower()
-    for begins in (True, False):
-        for group, words in GROUPS.items():
-            if any(lower.startswith(w) if begins else w in lower for w in words):
-                return group
-    return OTHER
-
-
 def label(name: str) -> str:
     """`mouthSmile_L` -> `Mouth smile left`; `expr07` -> `Expression 7`."""
     numbered = re.fullmatch(r"(?:expr|expression)_?(\d+)", name)
@@ -88,3 +64,7 @@ def label(name: str) -> str:
     words = re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)
     text = " ".join(SIDES.get(word, word.lower()) for word in words)
     return text[:1].upper() + text[1:] if text else name
+
+
+def _expression(index: int, name: str, group: str, low: float, high: float) -> Expression:
+    return Expression(index, name, label(name), group.capitalize(), low, high if high > low else low + 1)

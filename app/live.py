@@ -8,16 +8,22 @@ from collections.abc import Hashable
 from pathlib import Path
 
 import moderngl
+from cap4d.app.background import Backdrop, Background
+from cap4d.app.canvas import Canvas
 from cap4d.app.gl_context import is_software
 from cap4d.app.layout import Layout, share_out
 from cap4d.app.loading import load_avatar, open_playback
 from cap4d.app.options import Options
+from cap4d.app.overlays.overlays import Overlays
 from cap4d.app.recent import RecentFiles, config_folder
-from cap4d.app.renderers import CpuRenderer, GlRenderer, Overlay, Renderer
+from cap4d.app.renderers import CpuRenderer, GlRenderer, Renderer
 from cap4d.app.shortcuts import Action
+from cap4d.app.sound import Sound
+from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
 from cap4d.app.window import Window
 
+from cap4d.camera import Camera
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import statistics, write_stats
 from cap4d.player.video import check_file
@@ -66,6 +72,8 @@ def open_viewer(path: Path, options: Options) -> Viewer:
     )
     if options.avatar is not None:
         viewer.recent.add(options.avatar)
+    if options.audio is not None:
+        viewer.set_sound(Sound.load(options.audio))
     return viewer
 
 
@@ -92,10 +100,13 @@ class LivePlayer:
 
         self.window, self.viewer, self.backend = window, viewer, backend
         self.renderer = choose_renderer(backend, window.ctx, viewer.avatar)
-        self.overlay = Overlay(window.ctx)
+        self.backdrop, self.canvas = Backdrop(window.ctx), Canvas(window.ctx)
+        self.overlays = Overlays(window.ctx, viewer.avatar)
+        self.taking = Taking(viewer)
         self.gui, self.screen = Gui(window.ctx, scale=window.scale, clipboard=window), Screen()
         self.input = Input(self.gui, viewer)
         self.picture: moderngl.Texture | None = None
+        self.camera: Camera | None = None  # of the picture
         self.shown: Hashable = None  # what the picture on screen depends on
         self.frames = self.late = 0
         self.started = self.swapped = viewer.now
@@ -111,6 +122,7 @@ class LivePlayer:
 
     def close(self) -> None:
         """Ends what runs in the background, and Dear ImGui."""
+        self.taking.close()
         self.viewer.close()
         self.gui.release()
 
@@ -126,7 +138,7 @@ class LivePlayer:
         is_new = self._draw_picture(layout)
         if not (is_new or self.gui.is_moving or viewer.toasts.next_change(viewer.now) <= viewer.now):
             return False
-        self._show(layout)
+        self._show(layout, is_new)
         if is_new:
             self._count()
         return True
@@ -184,8 +196,10 @@ class LivePlayer:
         start = time.perf_counter()
         frame = viewer.frame()
         if isinstance(self.renderer, CpuRenderer):
-            self.renderer.background = viewer.background
-        self.picture = self.renderer.texture(frame, viewer.camera(frame, size))
+            color = viewer.background
+            self.renderer.background = color if isinstance(color, tuple) else None
+        self.camera = viewer.camera(frame, size)
+        self.picture = self.renderer.texture(frame, self.camera)
         seconds = time.perf_counter() - start
         viewer.avatar.stages.add("frame", seconds)
         if self.renderer.name == "cpu":
@@ -197,20 +211,23 @@ class LivePlayer:
         if avatar is drawn:
             return
         if avatar.bundle is drawn.bundle:
-            self.renderer.avatar = avatar
+            self.renderer.avatar = self.overlays.avatar = avatar
         else:
+            self.overlays = Overlays(self.window.ctx, avatar)
             self.picture = None
             self.renderer = choose_renderer(self.backend, self.window.ctx, avatar)
             self.window.set_title(f"{self.viewer.loaded.path.name} - cap4d-view")
 
-    def _show(self, layout: Layout) -> None:
+    def _show(self, layout: Layout, is_new: bool) -> None:
         """Lays the picture and the panels out, and puts them on screen."""
         window, viewer = self.window, self.viewer
+        place = layout.picture.in_pixels(window.size, window.framebuffer_size)
+        canvas = self._draw_canvas(place[2:], is_new) if self.picture is not None else None
         pixels = window.use()
         window.ctx.clear(*LEFT_OVER)
         if self.picture is not None:
-            window.ctx.viewport = layout.picture.in_pixels(window.size, pixels)
-            self.overlay.draw(self.picture, viewer.background, upright=True)
+            window.ctx.viewport = place
+            self.backdrop.draw(canvas or self.picture, viewer.background, upright=True)
             window.ctx.viewport = (0, 0, *pixels)
         now, start = viewer.now, time.perf_counter()
         self._draw_panels(layout, pixels, now)
@@ -219,10 +236,35 @@ class LivePlayer:
         window.show_cursor(self.gui.cursor())
         window.ctx.gc()
 
+    def _draw_canvas(self, size: tuple[int, int], is_new: bool) -> moderngl.Texture | None:
+        """The picture with its overlays, if there are any; a recording gets what is new of it."""
+        viewer, recording = self.viewer, self.taking.recorder is not None and is_new
+        self.overlays.shown, self.overlays.part = set(viewer.overlays), viewer.overlay_part
+        if not (viewer.overlays or recording) or min(size) < 1:
+            return None
+        if is_new or self.canvas.texture is None or self.canvas.texture.size != size:
+            self._fill_canvas(viewer.background, size)
+        if recording:
+            self.taking.add(self.canvas.read())
+        return self.canvas.texture
+
+    def _fill_canvas(self, background: Background, size: tuple[int, int]) -> None:
+        drawn_by = {"overlays": self.overlays, "renderer": self.renderer, "camera": self.camera}
+        self.canvas.draw(self.picture, background, size, **drawn_by)
+
+    def _take_screenshot(self) -> None:
+        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        if self.picture is None or min(width, height) < 1:
+            return
+        background = self.taking.behind(self.viewer.background)
+        self._fill_canvas(background, (width, height))
+        self.taking.screenshot(self.canvas.read(), is_transparent=background is None)
+        self.canvas.texture = None  # another background than on screen
+
     def _draw_panels(self, layout: Layout, pixels: tuple[int, int], now: float) -> None:
         try:
             with self.gui.frame(self.window.size, pixels, now - self.swapped):
-                self.screen.draw(self.viewer, layout)
+                self.screen.draw(self.viewer, layout, self.overlays.legends())
         except Exception as error:  # a panel that fails costs this picture's panels
             log.warning("panels: %s", error, exc_info=error)
         self.swapped = now
@@ -254,11 +296,20 @@ class LivePlayer:
         busy = BLINK_SECONDS / 5 if viewer.jobs.label is not None else IDLE_SECONDS
         return min(due, toasts, busy)
 
+    def _toggle_recording(self) -> None:
+        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        self.taking.toggle_recording((width, height))
+        self.gui.touch()
+
     def _obey(self) -> None:
         """Does what the user asked of the window itself."""
         while self.viewer.asked:
             match self.viewer.asked.popleft():
                 case Action.QUIT:
                     self.window.close()
+                case Action.SCREENSHOT:
+                    self._take_screenshot()
+                case Action.RECORD:
+                    self._toggle_recording()
                 case Action.FULLSCREEN:
                     self.window.toggle_fullscreen()

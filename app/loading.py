@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from cap4d.app.playback import ClipPlayback, Playback
+from cap4d.app.playback import ClipPlayback, Playback, StreamPlayback
 
 from cap4d.bundle.bundle import Bundle
 from cap4d.bundle.reader import read_bundle
+from cap4d.drive.fillers import Fillers
+from cap4d.drive.open_live import is_live, open_live
 from cap4d.drive.source import open_source
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import head_centre
@@ -68,11 +70,14 @@ def with_deformer(loaded: Loaded, deformer: str) -> Loaded:
 def open_playback(
     spec: str | None, bundle: Bundle, *, template: Path | None = None, fps: float | None = None
 ) -> Playback:
-    """What drives an avatar, from `--drive`'s words; it starts now.
+    """What drives an avatar, from `--drive`'s words; it starts now. What a live source lacks is filled in.
 
     Raises:
-        ArgumentError, DataError: See `open_source`.
+        ArgumentError, DataError: See `open_source` and `open_live`.
     """
+    if is_live(spec):
+        stream = open_live(spec, bundle, template=template, fps=fps, fillers=Fillers(bundle))
+        return StreamPlayback(stream, rig_name=bundle.rig_name)
     clip = open_source(spec, bundle, template=template, fps=fps)
     name = "idle clip" if spec is None else Path(spec).name
     return ClipPlayback(clip, time.monotonic(), name=name)

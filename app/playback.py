@@ -1,4 +1,4 @@
-"""What drives the avatar now, behind one protocol: a clip, which can be steered, or a live stream, which cannot."""
+"""What drives the avatar, behind one protocol: a clip, which can be steered, or a live stream."""
 
 from __future__ import annotations
 
@@ -84,6 +84,7 @@ class ClipPlayback:
         self.clock = PlayClock(clip.fps, now)
         self._smooth_hz: float | None = None
         self._number = 0
+        self.moves = 0  # how often it was put elsewhere than where it would have gone
 
     @property
     def dropped(self) -> int:
@@ -191,6 +192,7 @@ class ClipPlayback:
         return int(self._last * self.clock.fps + 1e-6)
 
     def _move(self, seconds: float, now: float) -> None:
+        self.moves += 1
         self._number = int(seconds * self.clock.fps + 1e-6)
         self.clock.seek(self._number, now)
 
@@ -198,7 +200,17 @@ class ClipPlayback:
 class Stream(Protocol):
     """What of `cap4d.drive.live.LiveStream` a window needs; see there."""
 
-    state: str
+    error: Exception | None
+
+    @property
+    def address(self) -> str: ...
+
+    @property
+    def state(self) -> str: ...
+
+    def __enter__(self) -> Stream: ...
+
+    def __exit__(self, *error: Any) -> None: ...
 
     def frame(self, now: float) -> Frame: ...
 
@@ -206,23 +218,21 @@ class Stream(Protocol):
 
     def statistics(self) -> dict[str, Any]: ...
 
-    def close(self) -> None: ...
-
 
 class StreamPlayback:
     """Plays what a live stream has at the display's rate, without a picture for what did not change.
 
     Args:
-        stream: Already running; closed with the playback.
-        name: Its address.
+        stream: Starts now; closed with the playback.
         rig_name: The rig that its frames are converted to.
         display_hz: How often to look.
     """
 
     is_live = True
 
-    def __init__(self, stream: Stream, *, name: str, rig_name: str, display_hz: float = DISPLAY_HZ) -> None:
-        self.stream, self.name, self.rig_name, self.display_hz = stream, name, rig_name, display_hz
+    def __init__(self, stream: Stream, *, rig_name: str, display_hz: float = DISPLAY_HZ) -> None:
+        self.stream, self.rig_name, self.display_hz = stream.__enter__(), rig_name, display_hz
+        self.is_closed = False
         self._frame: Frame | None = None
         self._number = -1
         self._looked = -np.inf
@@ -237,6 +247,15 @@ class StreamPlayback:
 
     def rewind(self, now: float) -> None:
         """See `Playback`: there is none."""
+
+    @property
+    def name(self) -> str:
+        return self.stream.address
+
+    @property
+    def error(self) -> Exception | None:
+        """Why nothing comes any more, or None."""
+        return self.stream.error
 
     @property
     def state(self) -> str:
@@ -265,7 +284,9 @@ class StreamPlayback:
         return self.stream.statistics()
 
     def close(self) -> None:
-        self.stream.close()
+        if not self.is_closed:
+            self.is_closed = True
+            self.stream.__exit__(None, None, None)
 
 
 def _same_pose(a: Frame, b: Frame) -> bool:

@@ -91,7 +91,8 @@ def _space(style: imgui.Style) -> None:
         "separator_text_padding": (0, 6),
     }
     numbers = {
-        "window_rounding": 8, "child_rounding": 6, "frame_rounding": 5, "popup_rounding": 6, "grab_rounding": 5,
+        "window_rounding": 8, "child_rounding": 6, "frame_rounding": 5, "popup_rounding": 6,
+        "grab_rounding": 5,
         "scrollbar_rounding": 6, "tab_rounding": 5, "scrollbar_size": 11, "grab_min_size": 10,
         "indent_spacing": 12, "window_border_size": 0, "popup_border_size": 1, "frame_border_size": 0,
         "child_border_size": 0, "separator_text_border_size": 1, "tab_bar_border_size": 1,

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from cap4d.app.background import WHITE, Background, Picture
 from cap4d.app.controls import Controls
 from cap4d.app.dropped import Use, use_of
 from cap4d.app.expressions import Expression, listed
@@ -17,14 +18,17 @@ from cap4d.app.jobs import Jobs
 from cap4d.app.loading import Loaded, load_avatar, open_playback, with_deformer
 from cap4d.app.orbit import Orbit
 from cap4d.app.overrides import Overrides
-from cap4d.app.playback import SPEEDS, ClipPlayback, Playback
+from cap4d.app.overlays.overlays import Overlay, Part
+from cap4d.app.playback import SPEEDS, ClipPlayback, Playback, StreamPlayback
 from cap4d.app.quality import Quality
 from cap4d.app.recent import RecentFiles
 from cap4d.app.shortcuts import Action
+from cap4d.app.sound import Sound, SoundPlayer
+from cap4d.app.soundtrack import Soundtrack
 from cap4d.app.timings import Timings
 from cap4d.app.toasts import Toasts
 
-from cap4d.camera import Camera
+from cap4d.camera import Camera, head_fixed
 from cap4d.drive.clip import Frame
 from cap4d.errors import Cap4dError
 from cap4d.player.avatar import Avatar
@@ -32,6 +36,7 @@ from cap4d.player.camera_path import camera_path, fitted
 
 Clock = Callable[[], float]
 
+NEAR_METRES = 0.25
 WINDOW_ACTIONS = (Action.SCREENSHOT, Action.RECORD, Action.QUIT, Action.FULLSCREEN)
 """What only the window can do; it takes them from `Viewer.asked`."""
 
@@ -71,7 +76,10 @@ class Viewer:
         self.shows_help = False
         self.dialog: Action | None = None  # OPEN or DRIVE, while its window is open
         self.is_welcome = is_welcome
-        self.background = (1.0, 1.0, 1.0)
+        self.background: Background = WHITE
+        self.soundtrack: Soundtrack | None = None
+        self.overlays: frozenset[Overlay] = frozenset()
+        self.overlay_part = Part.ALL
         self.display_hz = 60.0
         self.recording_since: float | None = None
         self.asked: deque[Action] = deque()
@@ -89,22 +97,17 @@ class Viewer:
 
     def close(self) -> None:
         """Ends what runs in the background."""
-        self.playback.close()
         self.jobs.close()
+        self.playback.close()
+        self.set_sound(None)
 
     # What is shown
 
     def number(self) -> Hashable:
         """Changes when the next picture would be another one; size and renderer apart."""
         playing = self.playback.number(self.now)
-        return (
-            self.avatar,
-            self.playback,
-            playing,
-            self.overrides.version,
-            self.controls.orbit,
-            self.background,
-        )
+        look = self.background, self.overlays, self.overlay_part
+        return self.avatar, self.playback, playing, self.overrides.version, self.controls.orbit, look
 
     def frame(self) -> Frame:
         """What the avatar does at the moment that `number` spoke of, the user's hand included."""
@@ -115,7 +118,10 @@ class Viewer:
         size = max(size[0], 1), max(size[1], 1)
         orbit = self.controls.orbit
         camera = orbit.camera(*size) if orbit is not None else fitted(self._path_camera(frame), size)
-        return replace(camera, viewmat=self.overrides.turned(camera.viewmat, self.loaded.centre))
+        viewmat = self.overrides.turned(camera.viewmat, self.loaded.centre)
+        if self.playback.is_live and self.camera_spec in ("static", "orbit"):
+            viewmat = _with_live_head(viewmat, frame)
+        return replace(camera, viewmat=viewmat)
 
     def settle(self) -> None:
         """Finds the deformer that suits this machine, if that is still to be done."""
@@ -128,6 +134,7 @@ class Viewer:
         finished = self.jobs.poll()
         if finished and self.jobs.label is None:
             self.is_settling = False
+        self._hear()
         return finished
 
     # What the user does
@@ -148,10 +155,15 @@ class Viewer:
         except Cap4dError as error:
             self.fail(error)
             return
-        if use is Use.AVATAR:
-            self.open_avatar(path)
-        else:
-            self.drive(str(path))
+        match use:
+            case Use.AVATAR:
+                self.open_avatar(path)
+            case Use.DRIVE:
+                self.drive(str(path))
+            case Use.SOUND:
+                self.jobs.start(f"Opening {path.name}", lambda: Sound.load(path), self.set_sound)
+            case Use.BACKGROUND:
+                self.jobs.start(f"Opening {path.name}", lambda: Picture.load(path), self._set_background)
 
     def open_avatar(self, path: Path) -> None:
         """Shows another avatar, in the background until it is loaded."""
@@ -169,15 +181,29 @@ class Viewer:
 
     def drive(self, spec: str | None) -> None:
         """Lets another source drive the avatar: a file, an address, or None for its own idle clip."""
-        bundle = self.loaded.bundle
+        bundle, before = self.loaded.bundle, self.playback
         name = "the idle clip" if spec is None else spec
-        self.jobs.start(f"Opening {name}", lambda: open_playback(spec, bundle), lambda p: self._play(p, spec))
+
+        def open_it() -> Playback:
+            if before.is_live:
+                before.close()  # the next one may listen to the same address
+            return open_playback(spec, bundle)
+
+        self.jobs.start(f"Opening {name}", open_it, lambda playback: self._play(playback, spec))
 
     def choose_deformer(self, tier: str) -> None:
         """Changes how the avatar's network is evaluated: one of its tiers, or `auto`."""
         self.wanted_deformer = tier
         self.is_settling = tier == "auto"
         self._change_deformer(tier, f"Changing to {tier}")
+
+    def set_sound(self, sound: Sound | None) -> None:
+        """Lets a sound play beside the clip, whose clock it then rules; None: silence."""
+        if self.soundtrack is not None:
+            self.soundtrack.close()
+        self.soundtrack = None if sound is None else Soundtrack(SoundPlayer.open(sound))
+        if sound is not None and isinstance(self.playback, ClipPlayback):
+            self.playback.rewind(self.now)
 
     def fail(self, error: BaseException) -> None:
         """Shows an error; nothing ends."""
@@ -209,7 +235,7 @@ class Viewer:
         bundle = loaded.bundle
         path = camera_path(self.camera_spec, bundle.camera, loaded.centre, fps=bundle.idle.fps, size=None)
         self.loaded, self._path, self._path_fps = loaded, path, bundle.idle.fps
-        self.expressions: list[Expression] = listed(bundle.subject.expression_names, bundle.expression_range)
+        self.expressions: list[Expression] = listed(bundle)
         self.overrides = Overrides(bundle.expression_range)
         self.controls.reset()
 
@@ -224,6 +250,20 @@ class Viewer:
         self.playback.close()
         self.playback = playback
 
+    def _set_background(self, picture: Picture) -> None:
+        self.background = picture
+
+    def _hear(self) -> None:
+        """Keeps sound and pictures together, and hears whether a source has given up."""
+        playback = self.playback
+        if self.soundtrack is not None:
+            self.soundtrack.follow(playback, self.now)
+        if isinstance(playback, StreamPlayback) and self.jobs.label is None:
+            if playback.error is not None:
+                self.fail(playback.error)
+            if playback.error is not None or playback.is_closed:
+                self.drive(None)
+
     def _path_camera(self, frame: Frame) -> Camera:
         return self._path(round(frame.t * self._path_fps), frame)
 
@@ -231,6 +271,16 @@ class Viewer:
         """The view of the path at this moment, for the user to take over."""
         self.playback.number(self.now)
         return Orbit.from_camera(self._path_camera(self.playback.frame()), self.loaded.centre)
+
+
+def _with_live_head(viewmat: np.ndarray, frame: Frame) -> np.ndarray:
+    """The head turned as a live source says. Where it stands is only taken over where that is near its own
+    place: a webcam's metres would take it out of the picture.
+    """
+    if frame.rot is None:
+        return viewmat
+    tra = np.zeros(3) if frame.tra is None or np.linalg.norm(frame.tra) > NEAR_METRES else frame.tra
+    return head_fixed(viewmat, frame.rot, tra)
 
 
 def _toggle(name: str) -> Callable[[Viewer], None]:

@@ -99,7 +99,7 @@ class Window:
 
     @property
     def scale(self) -> float:
-        """Window units per unit of design: above 1 where the display is dense and its pixels are the units."""
+        """Window units per unit of design: above 1 where a dense display's pixels are the units."""
         content, _ = glfw.get_window_content_scale(self.handle)
         pixels = self.framebuffer_size[0] / max(self.size[0], 1)
         return min(max(content / max(pixels, 1.0), 0.5), 4.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from cap4d.app.background import WHITE, Checkerboard
+from cap4d.app.panels.overlays import draw_overlays
 from cap4d.app.panels.widgets import ImVec2, ImVec4, choice, quiet, section, tip
 from cap4d.app.playback import ClipPlayback
 from cap4d.app.quality import CHOICES
@@ -39,6 +41,9 @@ class LookPanel:
         if section("Deformer"):
             _draw_deformers(viewer)
             imgui.spacing()
+        if section("Overlays"):
+            draw_overlays(viewer)
+            imgui.spacing()
         if section("Quality"):
             _draw_quality(viewer)
 
@@ -53,10 +58,15 @@ def _draw_background(viewer: Viewer) -> None:
         tip(name)
         imgui.same_line()
     flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.no_label
-    changed, color = imgui.color_edit3("##own", list(viewer.background), flags)
+    own = viewer.background if isinstance(viewer.background, tuple) else WHITE
+    changed, color = imgui.color_edit3("##own", list(own), flags)
     if changed:
         viewer.background = tuple(float(c) for c in color)
     tip("Any colour")
+    if imgui.radio_button("Transparent", isinstance(viewer.background, Checkerboard)):
+        viewer.background = Checkerboard()
+    tip("Screenshots keep their alpha")
+    quiet("Drop an image here to put it behind.")
 
 
 def _draw_deformers(viewer: Viewer) -> None:

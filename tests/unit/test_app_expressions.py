@@ -1,56 +1,47 @@
 """Expressions as people look for them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from cap4d.app.expressions import OTHER, group_of, grouped, label, listed, matching
+from cap4d.app.expressions import grouped, label, listed, matching
+from tiny_bundle import tiny_bundle
 
-NAMES = (
-    "mouthSmile_L",
-    "browInnerUp",
-    "eyeBlinkLeft",
-    "expr07",
-    "blink",
-    "jawOpen",
-    "tongueOut",
-    "noseSneer_R",
-)
-RANGES = np.tile(np.float32([0, 1]), (len(NAMES), 1))
+
+@pytest.fixture(scope="module")
+def bundle():
+    return tiny_bundle(network=False)
 
 
 @pytest.mark.parametrize(
-    ("name", "group", "text"),
+    ("name", "text"),
     [
-        ("mouthSmile_L", "Mouth", "Mouth smile left"),
-        ("browInnerUp", "Brows", "Brow inner up"),
-        ("eyeBlinkRight", "Eyes", "Eye blink right"),
-        ("blink", "Eyes", "Blink"),
-        ("cheekPuff", "Cheeks and nose", "Cheek puff"),
-        ("jawOpen", "Jaw", "Jaw open"),
-        ("tongueOut", "Tongue", "Tongue out"),
-        ("expr07", OTHER, "Expression 7"),
-        ("\u2603", OTHER, "\u2603"),
+        ("mouthSmile_L", "Mouth smile left"),
+        ("browInnerUp", "Brow inner up"),
+        ("eyeBlinkRight", "Eye blink right"),
+        ("expr07", "Expression 7"),
+        ("\u2603", "\u2603"),
     ],
 )
-def test_groups_and_labels(name, group, text):
-    assert (group_of(name), label(name)) == (group, text)
+def test_labels_are_words(name, text):
+    assert label(name) == text
 
 
-def test_they_stand_group_by_group_and_know_their_place_in_the_vector():
-    found = listed(NAMES, RANGES)
-    assert [e.name for e in found][:3] == ["browInnerUp", "eyeBlinkLeft", "blink"]
-    assert found[-1].group == OTHER
-    assert all(NAMES[e.index] == e.name for e in found)
-    assert list(grouped(found)) == ["Brows", "Eyes", "Cheeks and nose", "Jaw", "Mouth", "Tongue", OTHER]
+def test_they_stand_group_by_group_and_know_their_place_in_the_vector(bundle):
+    found = listed(bundle)
+    assert [e.name for e in found][:3] == ["browInnerUp", "eyeBlinkLeft", "eyeBlinkRight"]
+    assert all(bundle.subject.expression_names[e.index] == e.name for e in found)
+    assert list(grouped(found)) == ["Brows", "Eyes", "Jaw", "Mouth"]
 
 
-def test_an_empty_range_becomes_one_that_a_bar_can_have():
-    (only,) = listed(["a"], np.float32([[1, 1]]))
-    assert (only.low, only.high) == (1, 2)
+def test_an_empty_range_becomes_one_that_a_bar_can_have(bundle):
+    flat = replace(bundle, expression_range=np.ones_like(bundle.expression_range))
+    assert {(e.low, e.high) for e in listed(flat)} == {(1, 2)}
 
 
-def test_a_search_finds_by_name_label_and_group_whatever_the_case():
-    found = listed(NAMES, RANGES)
-    assert [e.name for e in matching(found, "SMILE left")] == ["mouthSmile_L"]
-    assert [e.name for e in matching(found, "cheeks")] == ["noseSneer_R"]
+def test_a_search_finds_by_name_label_and_group_whatever_the_case(bundle):
+    found = listed(bundle)
+    assert [e.name for e in matching(found, "SMILE left")] == ["mouthSmileLeft"]
+    assert [e.name for e in matching(found, "eyes")] == ["eyeBlinkLeft", "eyeBlinkRight"]
     assert matching(found, "  ") == found
     assert matching(found, "zzz") == []

@@ -12,7 +12,9 @@ def test_nothing_covers_the_picture_and_nothing_is_left_over(size, scale, sideba
     rects = [r for r in (layout.picture, layout.menu, layout.sidebar, layout.transport) if r is not None]
     assert sum(r.width * r.height for r in rects) == size[0] * size[1]
     for i, a in enumerate(rects):
-        assert 0 <= a.x and a.x + a.width <= size[0] and 0 <= a.y and a.y + a.height <= size[1]
+        assert min(a.x, a.y) >= 0
+        assert a.x + a.width <= size[0]
+        assert a.y + a.height <= size[1]
         for b in rects[:i]:
             apart_x = a.x + a.width <= b.x or b.x + b.width <= a.x
             apart_y = a.y + a.height <= b.y or b.y + b.height <= a.y

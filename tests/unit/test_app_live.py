@@ -378,7 +378,7 @@ def test_every_tab_menu_and_dialog_draws(play, monkeypatch):
 
 
 def test_a_failing_source_costs_its_pictures_and_is_said(play):
-    player, pane = play()
+    player, _ = play()
     player.run(1)
     playback = player.viewer.playback
     playback.clip = replace(playback.clip, expr=np.full_like(playback.clip.expr, np.nan))

@@ -105,10 +105,18 @@ def test_skipped_frames_are_counted(playback):
 class Stream:
     """A live stream that shows what the test put into it."""
 
-    state = "playing"
+    state, address, error = "playing", "tcp://127.0.0.1:9000", None
 
     def __init__(self, frame):
-        self.now_shown, self.seen, self.closed = frame, [], False
+        self.now_shown, self.seen, self.runs = frame, [], False
+
+    def __enter__(self):
+        self.runs = True
+        return self
+
+    def __exit__(self, *_):
+        assert self.runs
+        self.runs = False
 
     def frame(self, now):
         return self.now_shown
@@ -119,13 +127,10 @@ class Stream:
     def statistics(self):
         return {"dropped": 3, "late": 1}
 
-    def close(self):
-        self.closed = True
-
 
 def test_a_stream_is_looked_at_often_and_drawn_only_when_it_changes():
     stream = Stream(CLIP.frame(0))
-    playback = StreamPlayback(stream, name="tcp://127.0.0.1:9000", rig_name="tiny", display_hz=50)
+    playback = StreamPlayback(stream, rig_name="tiny", display_hz=50)
     first = playback.number(1.0)
     assert playback.due() == pytest.approx(1.02)
     stream.now_shown = replace(CLIP.frame(0), t=7.0)
@@ -139,9 +144,12 @@ def test_a_stream_is_looked_at_often_and_drawn_only_when_it_changes():
 
 def test_a_stream_hears_when_its_frame_is_on_screen_and_ends_with_the_playback():
     stream = Stream(CLIP.frame(0))
-    playback = StreamPlayback(stream, name="udp", rig_name="tiny")
+    playback = StreamPlayback(stream, rig_name="tiny")
+    assert stream.runs
+    assert playback.name == "tcp://127.0.0.1:9000"
     playback.shown(2.0)
     playback.close()
-    assert (stream.seen, stream.closed) == ([2.0], True)
+    playback.close()
+    assert (stream.seen, stream.runs, playback.is_closed) == ([2.0], False, True)
     assert playback.dropped == 3
     assert playback.state == "playing"
