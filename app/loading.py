@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,11 @@ class Loaded:
     @property
     def bundle(self) -> Bundle:
         return self.avatar.bundle
+
+    @cached_property
+    def tiers(self) -> tuple[str, ...]:
+        """The bundle's; to find them it looks through the network, too slow for every picture."""
+        return self.bundle.tiers
 
 
 def load_avatar(path: Path, deformer: str = "auto") -> Loaded:

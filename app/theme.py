@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import glfw  # noqa: F401  before imgui_bundle, which otherwise loads its own, X11-only GLFW
@@ -48,6 +49,7 @@ PLAIN = {
 }  # fmt: skip
 
 
+@cache
 def icon(symbol: str) -> str:
     """The symbol, or its word where there is no font for it."""
     return symbol if ICON_FONT.is_file() else PLAIN[symbol]

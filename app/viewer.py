@@ -295,7 +295,7 @@ def _close(viewer: Viewer) -> None:
 
 
 def _next_deformer(viewer: Viewer) -> None:
-    tiers = viewer.loaded.bundle.tiers
+    tiers = viewer.loaded.tiers
     viewer.choose_deformer(tiers[(tiers.index(viewer.avatar.tier) + 1) % len(tiers)])
 
 

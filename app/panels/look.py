@@ -70,7 +70,7 @@ def _draw_background(viewer: Viewer) -> None:
 
 
 def _draw_deformers(viewer: Viewer) -> None:
-    errors, tiers = viewer.loaded.bundle.tier_errors, viewer.loaded.bundle.tiers
+    errors, tiers = viewer.loaded.bundle.tier_errors, viewer.loaded.tiers
     for i, tier in enumerate(tiers):
         note = "exact" if i == 0 else error_text(errors.get(tier))
         if choice(TIERS[tier], tier == viewer.avatar.tier, note) and tier != viewer.avatar.tier:

@@ -33,8 +33,8 @@ def read_out(viewer: Viewer) -> str:
     """`30 fps   int8, 0.003 mm`; or what takes a moment."""
     if viewer.jobs.label is not None:
         return f"{viewer.jobs.label} ..."
-    bundle, tier = viewer.loaded.bundle, viewer.avatar.tier
-    error = "exact" if tier == bundle.tiers[0] else error_text(bundle.tier_errors.get(tier))
+    loaded, tier = viewer.loaded, viewer.avatar.tier
+    error = "exact" if tier == loaded.tiers[0] else error_text(loaded.bundle.tier_errors.get(tier))
     return f"{viewer.timings.fps():.0f} fps   {tier}, {error}"
 
 

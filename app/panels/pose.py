@@ -27,7 +27,7 @@ class Turn:
 
 
 TURNS = (
-    Turn("eye_rot", "Gaze", "eyes", (("Down, up", 0, 30), ("Left, right", 1, 40))),
+    Turn("eye_rot", "Gaze", "eyes", (("Up, down", 0, 30), ("Left, right", 1, 40))),
     Turn("neck_rot", "Neck", "neck", (("Nod", 0, 35), ("Turn", 1, 45), ("Tilt", 2, 30))),
     Turn("jaw_rot", "Jaw", "jaw", (("Open", 0, 25), ("Sideways", 1, 12))),
     Turn(HEAD, "Head", None, (("Nod", 0, 60), ("Turn", 1, 90), ("Tilt", 2, 45))),

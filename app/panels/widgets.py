@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from cap4d.app.theme import ACCENT, FIELD, FIELD_HOVERED, HELD, QUIET, TEXT, Color
 from imgui_bundle import imgui
 
@@ -20,6 +22,7 @@ SLIDER = imgui.SliderFlags_.always_clamp | imgui.SliderFlags_.no_round_to_format
 HIDDEN_GRAB = (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active)
 
 
+@cache
 def color32(color: Color, opacity: float = 1.0) -> int:
     """A colour as draw lists take it."""
     red, green, blue, alpha = (round(255 * min(max(c, 0.0), 1.0)) for c in (*color[:3], color[3] * opacity))
@@ -134,6 +137,13 @@ def choice(label: str, chosen: bool, note: str = "") -> bool:
     return picked
 
 
+def shortened(text: str, most: int = 26) -> str:
+    """`a long file name` -> `a long...ile name`"""
+    if len(text) <= most:
+        return text
+    return f"{text[: most // 2 - 2]}...{text[-(most // 2 - 1) :]}"
+
+
 def section(title: str, *, opened: bool = True) -> bool:
     """A heading that folds what is under it."""
     flags = imgui.TreeNodeFlags_.default_open if opened else 0
@@ -150,5 +160,5 @@ def pairs(key: str, rows: list[tuple[str, str]]) -> None:
             imgui.table_next_column()
             quiet(name)
             imgui.table_next_column()
-            imgui.text_unformatted(value)
+            imgui.text_unformatted(shortened(value))
         imgui.end_table()
