@@ -20,6 +20,7 @@ class Renderer(Protocol):
     """Draws one avatar."""
 
     name: str
+    avatar: Avatar
     vertices: np.ndarray
     """float32[G, 3] m: the posed grid of the last picture; the call after the next overwrites it."""
 

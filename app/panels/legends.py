@@ -1,10 +1,11 @@
-"""Legends of overlays as Dear ImGui draws them: colour bars in the window's lower left corner."""
+"""Legends of overlays as Dear ImGui draws them: colour bars in the picture's lower right corner."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
 
+from cap4d.app.layout import Rect
 from cap4d.app.overlays.legend import Legend
 from imgui_bundle import imgui
 
@@ -20,12 +21,12 @@ PANEL = (
 )
 
 
-def show_legends(legends: Sequence[Legend]) -> None:
+def draw_legends(legends: Sequence[Legend], place: Rect) -> None:
     """Adds a panel to the frame of Dear ImGui that is being made; none where there are no legends."""
     if not legends:
         return
-    size = imgui.get_io().display_size
-    imgui.set_next_window_pos(imgui.ImVec2(MARGIN, size.y - MARGIN), pivot=imgui.ImVec2(0, 1))
+    corner = imgui.ImVec2(place.x + place.width - MARGIN, place.y + place.height - MARGIN)
+    imgui.set_next_window_pos(corner, pivot=imgui.ImVec2(1, 1))
     imgui.set_next_window_bg_alpha(0.8)
     imgui.begin("legends", None, PANEL)
     for legend in legends:
