@@ -12,9 +12,10 @@ from dataclasses import replace
 from cap4d.app.overlays.color_map import color_map
 from cap4d.app.background import Backdrop, Checkerboard
 from cap4d.app.gl_context import GlUnavailableError, headless_context
+from cap4d.app.layout import Rect
 from cap4d.app.overlays.legend import Legend, rounded_up, ticks
-from cap4d.app.overlays.legend_panel import show_legends
 from cap4d.app.overlays.overlays import Overlay, Overlays, Part
+from cap4d.app.panels.legends import draw_legends
 from cap4d.app.renderers import CpuRenderer, GlRenderer
 from imgui_bundle import imgui
 from tiny_bundle import tiny_bundle
@@ -164,7 +165,7 @@ def test_legends_are_drawn() -> None:
         for legends in ([], [Legend("Gaussians per pixel", color_map("magma"), ticks(20.0))]):
             for _ in range(2):  # a panel that finds its size is hidden at first
                 imgui.new_frame()
-                show_legends(legends)
+                draw_legends(legends, Rect(0, 0, 400, 300))
                 imgui.render()
             corners.append(imgui.get_draw_data().total_vtx_count)
         assert corners[0] == 0 and corners[1] > 4 * 16 + 4 * len("Gaussiansperpixel")
