@@ -22,9 +22,8 @@ class WatchedWindow(Window):
 
     def swap(self) -> None:
         width, height = self.framebuffer_size
-        flat = np.frombuffer(self.ctx.screen.read(components=3, alignment=1), np.uint8)
-        if len(flat) == 3 * width * height:  # else it is being resized
-            self.picture = flat.reshape(height, width, 3)[::-1]
+        pixels = self.ctx.screen.read(viewport=(width, height), components=3, alignment=1)
+        self.picture = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)[::-1]
         super().swap()
 
 

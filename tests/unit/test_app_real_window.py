@@ -61,24 +61,32 @@ json.dump(found, open("found.json", "w"))
 """
 
 
-@pytest.mark.skipif(
+needs_x = pytest.mark.skipif(
     any(shutil.which(name) is None for name in ("xvfb-run", "xauth", "xdotool")),
     reason="needs xvfb-run, xauth and xdotool (Debian: xvfb xauth xdotool)",
 )
-def test_a_real_pointer_and_keyboard_work_it(tmp_path):
-    write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
-    (tmp_path / "broken.cap4d").write_bytes((tmp_path / "tiny.cap4d").read_bytes()[:3000])
+
+
+def run(program, folder, *, screen="1280x800x24"):
+    """What a program wrote to found.json under an X server of its own, and what it said on stderr."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS / "unit")]),
         "LIBGL_ALWAYS_SOFTWARE": "1",
-        "XDG_CONFIG_HOME": str(tmp_path / "config"),
+        "XDG_CONFIG_HOME": str(folder / "config"),
     }
-    run = ["xvfb-run", "-a", "-s", "-screen 0 1280x800x24", sys.executable, "-c", PROGRAM]
-    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=170)
+    words = ["xvfb-run", "-a", "-s", f"-screen 0 {screen}", sys.executable, "-c", program]
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=170)
     if "window: expected OpenGL 4.1" in done.stderr:
         pytest.skip("the X server has no OpenGL 4.1")
     assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "found.json").read_text())
+    return json.loads((folder / "found.json").read_text()), done.stderr
+
+
+@needs_x
+def test_a_real_pointer_and_keyboard_work_it(tmp_path):
+    write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
+    (tmp_path / "broken.cap4d").write_bytes((tmp_path / "tiny.cap4d").read_bytes()[:3000])
+    found, _ = run(PROGRAM, tmp_path)
     assert found["paused"]
     assert found["held"] == ["browInnerUp"]
     assert 0.4 < found["value"] <= 1
@@ -90,3 +98,33 @@ def test_a_real_pointer_and_keyboard_work_it(tmp_path):
     assert any("nothing.xyz" in text for text in found["messages"])
     assert found["closed"]
     assert json.loads((tmp_path / "config/cap4d/recent.json").read_text()) == [str(tmp_path / "tiny.cap4d")]
+
+
+SOAK = """
+import json
+from pathlib import Path
+from real_window import WatchedWindow, open_player, pump
+from window_soak import errors_said, soak_round, write_droppings
+
+with WatchedWindow("soak", 760, 480) as window:
+    player = open_player(window, ["tiny.cap4d", "--backend", BACKEND], Path())
+    pump(player, lambda: player.frames > 0)
+    soak_round(player, write_droppings(Path.cwd(), Path("tiny.cap4d")), Path.cwd())
+    found = {"errors": errors_said(player), "shape": window.picture.shape, "tier": player.viewer.avatar.tier}
+    found["files"] = sorted(p.name for p in Path.cwd().glob("tiny_0*"))
+    player.close()
+json.dump(found, open("found.json", "w"))
+"""
+
+
+@needs_x
+@pytest.mark.parametrize("backend", ["cpu", pytest.param("gl", marks=pytest.mark.slow)])
+def test_panels_sizes_and_drops_while_it_records(tmp_path, backend):
+    write_bundle(tiny_bundle(), tmp_path / "tiny.cap4d")
+    found, said = run(SOAK.replace("BACKEND", repr(backend)), tmp_path, screen="4096x2304x24")
+    assert said == ""
+    assert found["shape"] == [760, 1180, 3]
+    assert found["files"] == ["tiny_0001.mp4", "tiny_0001.png"]
+    for text in found["errors"]:  # each of what was dropped and is nothing
+        assert any(name in text for name in ("broken.cap4d", "broken.npz", "missing.wav", "notes.txt")), text
+    assert found["errors"]
