@@ -134,11 +134,14 @@ class LivePlayer:
         self._obey()
         if min(self.window.framebuffer_size) < 1:
             return False
-        layout = self._layout()
+        layout, start = self._layout(), time.perf_counter()
         is_new = self._draw_picture(layout)
         if not (is_new or self.gui.is_moving or viewer.toasts.next_change(viewer.now) <= viewer.now):
             return False
         self._show(layout, is_new)
+        if is_new and self.renderer.name == "cpu":
+            viewer.quality.picture_took(time.perf_counter() - start, viewer.playback.interval)
+        self.window.swap()
         if is_new:
             self._count()
         return True
@@ -200,10 +203,7 @@ class LivePlayer:
             self.renderer.background = color if isinstance(color, tuple) else None
         self.camera = viewer.camera(frame, size)
         self.picture = self.renderer.texture(frame, self.camera)
-        seconds = time.perf_counter() - start
-        viewer.avatar.stages.add("frame", seconds)
-        if self.renderer.name == "cpu":
-            viewer.quality.picture_took(seconds, viewer.playback.interval)
+        viewer.avatar.stages.add("frame", time.perf_counter() - start)
 
     def _follow_avatar(self) -> None:
         """The renderer draws the viewer's avatar, which may have another deformer, or be another one."""
@@ -219,7 +219,7 @@ class LivePlayer:
             self.window.set_title(f"{self.viewer.loaded.path.name} - cap4d-view")
 
     def _show(self, layout: Layout, is_new: bool) -> None:
-        """Lays the picture and the panels out, and puts them on screen."""
+        """Lays the picture and the panels out in the window."""
         window, viewer = self.window, self.viewer
         place = layout.picture.in_pixels(window.size, window.framebuffer_size)
         canvas = self._draw_canvas(place[2:], is_new) if self.picture is not None else None
@@ -232,7 +232,6 @@ class LivePlayer:
         now, start = viewer.now, time.perf_counter()
         self._draw_panels(layout, pixels, now)
         viewer.avatar.stages.add("gui", time.perf_counter() - start)
-        window.swap()
         window.show_cursor(self.gui.cursor())
         window.ctx.gc()
 

@@ -15,7 +15,7 @@ RECORDING_FPS = 30.0
 
 
 class Taking:
-    """Takes pictures of what a viewer shows, into the folder where the program was started, or the user's own.
+    """Takes pictures of what a viewer shows, into the folder of the program's start, or the user's own.
 
     Args:
         viewer: Hears what became of it.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from cap4d.app.panels.widgets import ImVec2, color32, pairs, quiet, section
-from cap4d.app.theme import FIELD, QUIET, Color
+from cap4d.app.theme import FIELD, PANEL, QUIET, Color
 from cap4d.app.timings import HISTORY, STAGES
 from cap4d.app.viewer import Viewer
 from imgui_bundle import imgui
@@ -58,7 +58,7 @@ def statistics_rows(statistics: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = []
     for name, value in statistics.items():
         if isinstance(value, Mapping):
-            rows += [(f"{name}: {inner}", _shown(v)) for inner, v in value.items() if v]
+            rows += [(f"{name}: {inner}".replace("_", " "), _shown(v)) for inner, v in value.items() if v]
         else:
             rows.append((name.replace("_", " "), _shown(value)))
     return rows
@@ -103,7 +103,13 @@ def _draw_graph(rows: np.ndarray) -> None:
                 )
                 below = above
     draw.pop_clip_rect()
-    draw.add_text(ImVec2(at.x + 6, at.y + 4), color32(QUIET), f"{top:.0f} ms")
+    _draw_label(ImVec2(at.x + 6, at.y + 5), f"{top:.0f} ms")
+
+
+def _draw_label(at: ImVec2, text: str) -> None:
+    draw, size = imgui.get_window_draw_list(), imgui.calc_text_size(text)
+    draw.add_rect_filled(ImVec2(at.x - 4, at.y - 2), ImVec2(at.x + size.x + 4, at.y + size.y + 2), LABEL, 4)
+    draw.add_text(at, color32(QUIET), text)
 
 
 def _draw_legend(numbers: Mapping[str, float]) -> None:
@@ -123,4 +129,5 @@ def _draw_legend(numbers: Mapping[str, float]) -> None:
         imgui.end_table()
 
 
+LABEL = color32(PANEL, 0.75)
 PACKED = {name: color32(color) for name, color in COLORS.items()}

@@ -11,6 +11,7 @@ from cap4d.app.viewer import Viewer
 from imgui_bundle import imgui
 
 STATES: dict[str, Color] = {"playing": GOOD, "holding": HELD, "easing": HELD, "waiting": QUIET}
+WORDS = {"waiting": "waiting for a sender at", "easing": "the sender is silent:", "holding": "holding"}
 
 
 class Transport:
@@ -97,7 +98,7 @@ def _draw_live(viewer: Viewer, playback: Playback) -> None:
     color = STATES.get(state, BAD)
     imgui.align_text_to_frame_padding()
     imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*color))
-    imgui.text_unformatted(f"{icon(Icon.LIVE)}  {state}")
+    imgui.text_unformatted(f"{icon(Icon.LIVE)}  {WORDS.get(state, state)}")
     imgui.pop_style_color()
     imgui.same_line(0, 12)
     quiet(playback.name)

@@ -74,7 +74,7 @@ def _paint_bar(text: str, value: float, low: float, high: float, held: bool, num
     pad = imgui.get_style().frame_padding
     draw.push_clip_rect(least, most, True)
     y = least.y + pad.y
-    shown = number % value
+    shown = signless_zero(number % value)
     size = imgui.calc_text_size(shown)
     draw.add_text(ImVec2(least.x + pad.x, y), color32(HELD if held else TEXT), text)
     draw.add_text(ImVec2(most.x - pad.x - size.x, y), color32(HELD if held else QUIET), shown)
@@ -137,6 +137,11 @@ def choice(label: str, chosen: bool, note: str = "") -> bool:
     return picked
 
 
+def signless_zero(text: str) -> str:
+    """`-0.00` -> `0.00`"""
+    return text if any(digit in text for digit in "123456789") else text.removeprefix("-")
+
+
 def shortened(text: str, most: int = 26) -> str:
     """`a long file name` -> `a long...ile name`"""
     if len(text) <= most:
@@ -160,5 +165,8 @@ def pairs(key: str, rows: list[tuple[str, str]]) -> None:
             imgui.table_next_column()
             quiet(name)
             imgui.table_next_column()
-            imgui.text_unformatted(shortened(value))
+            shown = shortened(value)
+            room = imgui.get_content_region_avail().x - imgui.calc_text_size(shown).x
+            imgui.set_cursor_pos_x(imgui.get_cursor_pos_x() + max(room, 0))
+            imgui.text_unformatted(shown)
         imgui.end_table()

@@ -445,7 +445,11 @@ def test_a_real_window_opens_plays_and_closes(backend, tmp_path):
     write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
     arguments = ["tiny.cap4d", "--frames", "12", "--size", "200x160", "--backend", backend]
     program = [sys.executable, "-c", WINDOW_PROGRAM, "last.npy", *arguments]
-    environment = os.environ | {"PYTHONPATH": str(HERE.parent), "LIBGL_ALWAYS_SOFTWARE": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": str(HERE.parent),
+        "LIBGL_ALWAYS_SOFTWARE": "1",
+        "XDG_CONFIG_HOME": str(tmp_path),
+    }
     run = ["xvfb-run", "-a", *program]
     done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     if "window: expected OpenGL 4.1" in done.stderr:
