@@ -19,6 +19,8 @@ from cap4d.player.offline import Draw, Output, draw_on_cpu, pipeline_threads, re
 
 log = logging.getLogger(__name__)
 
+PICTURE = 512, 512  # px, where no size is asked for
+
 
 def play_headless(path: Path, options: Options) -> None:
     """Renders the avatar at `path` to `options.out`, or to a video of its name in the current folder.
@@ -34,11 +36,10 @@ def play_headless(path: Path, options: Options) -> None:
     if options.pipeline and backend != "cpu":
         raise ArgumentError(f"pipeline: expected the cpu backend, got {backend}")
     out = options.out or f"{path.stem}.mp4"
-    output = Output(out, frames=options.frames, size=options.size, stats=options.stats)
+    size = options.size or PICTURE
+    output = Output(out, frames=options.frames, size=size, stats=options.stats, audio=options.audio)
     pipelined = options.pipeline
-    stats = render_to(
-        avatar, clip, options.camera, output, draw=draw, backend=backend, pipelined=pipelined
-    )
+    stats = render_to(avatar, clip, options.camera, output, draw=draw, backend=backend, pipelined=pipelined)
     log.info("%s: %d frames, %.1f fps (%s)", out, stats["frames"], stats["fps"], backend)
 
 
