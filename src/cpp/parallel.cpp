@@ -1,4 +1,5 @@
-// A small persistent pool behind parallel_for. It runs one job at a time; a caller that finds it at work, and nested calls, work alone.
+// A small persistent pool behind parallel_for. Callers at the same time share its threads: the oldest job that wants more is helped first.
+// Nested calls work alone.
 #include "parallel.h"
 
 #include <algorithm>
@@ -22,6 +23,8 @@ struct Job {
   std::size_t n, grain;
   const std::function<void(std::size_t, std::size_t)>* body;
   std::atomic<std::size_t> next{0};
+  int wanted = 0;              // helpers that have not come yet; of the pool's mutex
+  std::atomic<int> active{0};  // helpers at work; changed only under the pool's mutex
   std::exception_ptr error;
   std::mutex error_mutex;
 
@@ -43,25 +46,24 @@ struct Job {
 
 class Pool {
  public:
-  // False, and nothing done, while another caller's job runs.
-  bool run(Job& job, int helpers) {
-    std::unique_lock busy(busy_mutex_, std::try_to_lock);
-    if (!busy) return false;
+  void run(Job& job, int helpers) {
     {
       std::lock_guard lock(mutex_);
       while (static_cast<int>(workers_.size()) < helpers) workers_.emplace_back([this] { work(); });
-      job_ = &job;
-      wanted_ = helpers;
-      active_ = 0;
+      job.wanted = helpers;
+      jobs_.push_back(&job);
+      wanted_ += helpers;
     }
     wake_.notify_all();
     job.run();
-    spin_while([this] { return active_.load(std::memory_order_acquire) > 0; });
+    {
+      std::lock_guard lock(mutex_);
+      jobs_.erase(std::find(jobs_.begin(), jobs_.end(), &job));
+      wanted_ -= job.wanted;  // a worker that has not started yet need not
+    }
+    spin_while([&job] { return job.active.load(std::memory_order_acquire) > 0; });
     std::unique_lock lock(mutex_);
-    wanted_ = 0;  // a worker that has not started yet need not
-    done_.wait(lock, [this] { return active_ == 0; });
-    job_ = nullptr;
-    return true;
+    done_.wait(lock, [&job] { return job.active == 0; });
   }
 
   ~Pool() {
@@ -79,13 +81,13 @@ class Pool {
     for (;;) {
       wake_.wait(lock, [this] { return stop_ || wanted_ > 0; });
       if (stop_) return;
-      --wanted_;
-      ++active_;
-      Job* job = job_;
+      Job& job = **std::find_if(jobs_.begin(), jobs_.end(), [](const Job* j) { return j->wanted > 0; });
+      --wanted_, --job.wanted;
+      ++job.active;
       lock.unlock();
-      job->run();
+      job.run();
       lock.lock();
-      if (--active_ == 0) done_.notify_all();
+      if (--job.active == 0) done_.notify_all();
       lock.unlock();
       spin_while([this] { return wanted_.load(std::memory_order_acquire) == 0; });
       lock.lock();
@@ -107,11 +109,11 @@ class Pool {
 #endif
   }
 
-  std::mutex busy_mutex_, mutex_;
+  std::mutex mutex_;
   std::condition_variable wake_, done_;
   std::vector<std::thread> workers_;
-  Job* job_ = nullptr;
-  std::atomic<int> wanted_{0}, active_{0};  // changed only under the mutex
+  std::vector<Job*> jobs_;      // running, the oldest first
+  std::atomic<int> wanted_{0};  // by all of them; changed only under the mutex
   bool stop_ = false;
 };
 
@@ -142,7 +144,7 @@ void parallel_for(std::size_t n, std::size_t grain, int threads, const std::func
   }
   Job job;
   job.n = n, job.grain = grain, job.body = &body;
-  if (!pool().run(job, helpers)) job.run();
+  pool().run(job, helpers);
   if (job.error) std::rethrow_exception(job.error);
 }
 

@@ -33,6 +33,15 @@ bool rethrows(int threads) {
   return false;
 }
 
+// Two items that wait for each other: callers at the same time, each of which needs a helper, get one in turn.
+void meet() {
+  std::atomic<int> arrived{0};
+  cap4d::parallel_for(2, 1, 2, [&](std::size_t, std::size_t) {
+    ++arrived;
+    while (arrived < 2) std::this_thread::yield();
+  });
+}
+
 }  // namespace
 
 int main() {
@@ -43,6 +52,7 @@ int main() {
       for (int round = 0; round < 300; ++round) {
         const int threads = 1 + (caller + round) % 5;
         if (!sums_up(static_cast<std::size_t>(round), threads)) ++failures;
+        meet();
         if (round % 10 == 0 && !rethrows(threads)) ++failures;
       }
     });
