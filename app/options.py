@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cap4d.errors import ArgumentError
@@ -16,6 +16,8 @@ EXAMPLES = """examples:
   cap4d-view me.cap4d --drive speech.npy --template neutral.npy --fps 30
   cap4d-view me.cap4d --headless --frames 120 --out out.mp4 --stats stats.json
   cap4d-view me.cap4d --headless --camera orbit --out frame_%04d.png
+  cap4d-view me.cap4d --serve                  a page for a browser on this machine
+  cap4d-view me.cap4d --serve 0.0.0.0:8300     for others too: to whom you give the address and its token
 
 keys: space pause, left/right step a frame, r reset, h read-out, q or escape quit
 """
@@ -26,6 +28,7 @@ DEFORMER_HELP = (
     "how the deformation network is evaluated, as far as the avatar has it (cap4d inspect); auto: the most "
     "exact, in a window the most exact that takes at most 8 ms a frame on this machine (default: auto)"
 )
+SERVE = "127.0.0.1:8300"
 
 
 @dataclass(frozen=True)
@@ -45,11 +48,16 @@ class Options:
     out: str | None
     camera: str
     stats: Path | None
+    serve: str | None
+    token: str | None
 
 
 def parse_options(argv: Sequence[str] | None = None) -> Options:
     """Exits with code 2 and one line on a bad argument, with 0 after `--help`."""
-    return Options(**vars(build_parser().parse_args(argv)))
+    options = Options(**vars(build_parser().parse_args(argv)))
+    if options.avatar is None and options.serve is not None and ":" not in options.serve:
+        return replace(options, avatar=Path(options.serve), serve=SERVE)  # `--serve me.cap4d`
+    return options
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -84,6 +92,14 @@ def build_parser() -> argparse.ArgumentParser:
     add("--out", metavar="FILE", help="out.mp4, frame_%%04d.png or one.png (headless: default <avatar>.mp4)")
     add("--camera", default="static", metavar="static|orbit|FILE", help="camera path (default: static)")
     add("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
+    add(
+        "--serve",
+        nargs="?",
+        const=SERVE,
+        metavar="HOST:PORT",
+        help=f"no window: a page for browsers, which pictures of at most --size are sent to (default: {SERVE})",
+    )
+    add("--token", metavar="X", help="what --serve asks for (default: made up where others can reach it)")
     return parser
 
 

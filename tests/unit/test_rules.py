@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE_RING = ("rig", "bundle", "player", "drive")
-PLAYER_MODULES = {"numpy", "onnxruntime", "safetensors", "moderngl", "glfw", "imgui_bundle", "av"}
+PLAYER_MODULES = {"numpy", "onnxruntime", "safetensors", "moderngl", "glfw", "imgui_bundle", "av", "websockets"}
 FILE_ROOMS = ("rig", "bundle", "player", "drive", "capture", "track", "export", "avatar", "synth")
 
 
