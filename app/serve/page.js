@@ -84,6 +84,7 @@ function count(head) {
     $("notice").textContent = "";
   }
   if (!scrubbing) fill($("at"), head.at);
+  $("live").textContent = { waiting: "waiting for frames", playing: "live", holding: "live, no frames", easing: "live, no frames" }[head.stream] || "";
 }
 
 setInterval(() => {

@@ -21,6 +21,7 @@ EPSILON = 1e-6  # of a frame, for times that are a frame's but for rounding
 class Stream(Protocol):
     """What is needed of `cap4d.drive.live.LiveStream`."""
 
+    state: str
     error: Exception | None
 
     def frame(self, now: float) -> Frame: ...
@@ -34,10 +35,12 @@ class ClipTime:
     """A clip on the wall clock, again and again. Times in s of one clock.
 
     Attributes:
+        state: What a live stream does; nothing of a clip.
         error: Why nothing comes any more; a clip always comes.
     """
 
     is_live = False
+    state = ""
     error = None
 
     def __init__(self, clip: Clip, now: float) -> None:
@@ -98,6 +101,11 @@ class StreamTime:
     def due(self, now: float) -> float:
         """See `ClipTime`."""
         return math.inf if self.paused else (int(now * self.fps) + 1) / self.fps
+
+    @property
+    def state(self) -> str:
+        """`waiting`, `playing`, `holding` or `easing`."""
+        return str(self.stream.state)
 
     @property
     def error(self) -> Exception | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,6 +27,7 @@ from cap4d.player.video import check_file
 log = logging.getLogger(__name__)
 
 MAX_WATCHERS = 4
+SIZE = 512, 512  # px of the largest picture, unless told otherwise
 
 
 def play_page(path: Path, options: Options) -> None:
@@ -51,7 +53,7 @@ def play_page(path: Path, options: Options) -> None:
             Performance(source, avatar.bundle),
             cameras,
             backend=options.backend,
-            area=options.size[0] * options.size[1],
+            area=math.prod(options.size or SIZE),
             limit=MAX_WATCHERS,
         )
         studio.start()
@@ -78,7 +80,7 @@ def _open(options: Options, avatar: Avatar, stack: ExitStack) -> ClipTime | Stre
 def _finish(studio: Studio, options: Options) -> None:
     studio.stop()
     if options.stats is not None:
-        write_stats(options.stats, page_statistics(studio, options.size))
+        write_stats(options.stats, page_statistics(studio, options.size or SIZE))
 
 
 def serve_studio(studio: Studio, gate: Gate, port: int, *, title: str) -> None:

@@ -214,11 +214,11 @@ class Studio:
                 self._changed.wait(self._nap(now))
                 return True
             frame = self._seen = self.performance.frame(now)
-            position = self.performance.source.position(now)
+            position, stream = self.performance.source.position(now), self.performance.source.state
         with self.avatar.stages.time("frame"):
             pictures = self._paint(painter, encoder, frame, moment, set(wanted.values()))
         done = self.clock()
-        head = {"at": round(position, 3), "drawn": round((done - now) * 1e3, 2)}
+        head = {"at": round(position, 3), "stream": stream, "drawn": round((done - now) * 1e3, 2)}
         with self._changed:
             self.moments += 1
             self.performance.source.drawn(done)
@@ -265,7 +265,7 @@ def turned(camera: Camera, frame: Frame) -> Camera:
 def picture_message(head: dict[str, Any], jpeg: bytes, watcher: Watcher, shot: Shot) -> bytes:
     """u32 length of the head (little-endian), the head as JSON, the JPEG.
 
-    The head: `n` the picture's number, to be echoed when it is shown; `at` s in the clip; `drawn` ms;
+    The head: `n` the picture's number, to be echoed when it is shown; `at` s in the clip; `stream` a live stream's state; `drawn` ms;
     `latency` ms, median of late; `size`; `quantiser`.
     """
     latency = watcher.pace.latency

@@ -200,7 +200,7 @@ def test_a_clip_stands_goes_on_and_moves():
 
 
 class FakeStream:
-    error = None
+    state, error = "playing", None
 
     def frame(self, now: float) -> Frame:
         zero = np.zeros(3, np.float32)

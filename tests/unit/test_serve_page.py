@@ -38,6 +38,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from cap4d.bundle import write_bundle
+from cap4d.drive.packet import Packet
+from cap4d.drive.wire import format_packet
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import camera_path
 
@@ -437,7 +439,13 @@ def command(*words: str) -> Iterator[tuple[subprocess.Popen, str]]:
     line = [sys.executable, "-m", "cap4d.app.main", "tiny.cap4d", "--deformer", "off", *words]
     with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
         try:
-            yield process, next(line.strip() for line in process.stderr if line.startswith("http"))
+            told = []
+            for line in process.stderr:
+                if line.startswith("http"):
+                    break
+                told.append(line.strip())
+            process.told = "\n".join(told)
+            yield process, line.strip()
         finally:
             process.kill()
 
@@ -461,6 +469,36 @@ def test_an_interrupt_ends_it_and_writes_the_statistics(tiny):
     assert stats["serve"]["pictures"] >= 4
     assert 0 < stats["serve"]["latency_ms"]["median"] <= stats["serve"]["latency_ms"]["p95"]
     assert {"jpeg", "splat", "frame"} <= stats["stages"].keys()
+
+
+def test_a_live_source_moves_the_face_and_is_in_the_statistics(tiny):
+    words = ("--serve", ":0", "--drive", "tcp://127.0.0.1:0", "--stats", "s.json", "--size", "64x64")
+    with command(*words) as (process, address):
+        source = process.told.rpartition(":")[2]
+        with connect(f"ws://{address.split('/')[2]}/socket", compression=None, proxy=None) as line:
+            client = Client(line)
+            assert client.told[0]["hello"]["live"]
+            head, still = client.picture()
+            assert head["stream"] == "waiting"
+            with socket.create_connection(("127.0.0.1", int(source))) as sender:
+                moved, number = still, 0
+                until = time.monotonic() + PATIENCE
+                while head["stream"] != "playing" or difference(still, moved) < 30:
+                    assert time.monotonic() < until
+                    packet = Packet(number / 30, "tiny", np.float32([1, 1, 1, 1, 1]))
+                    sender.sendall(format_packet(packet))
+                    head, moved = client.picture()
+                    number += 1
+        os.kill(process.pid, signal.SIGINT)
+        process.stderr.read()
+    drive = json.loads(Path("s.json").read_text())["drive"]
+    assert drive["received"] >= 1
+    assert drive["latency_ms"]["median"] > 0
+
+
+def difference(a: bytes, b: bytes) -> int:
+    """The largest between two JPEGs."""
+    return int(np.abs(decoded(a).astype(int) - decoded(b)).max())
 
 
 # a real browser ------------------------------------------------------------------------------------
