@@ -57,5 +57,5 @@ class StandardInputReceiver:
                     return
 
     def _has_more(self, timeout: float) -> bool:
-        """Whether reading would not wait. Windows cannot tell for pipes: there it is read in a thread that waits."""
+        """Whether reading would not wait. Windows cannot tell: there the thread waits."""
         return os.name != "posix" or bool(select.select([self._file], [], [], timeout)[0])

@@ -1,7 +1,7 @@
 """Frames over WebSocket: the player is the server, a sender's message is a line of JSON (`wire`), or several.
 
-A web page may drive the player of the computer it is looked at on only with the token, or when it comes from that
-computer itself: browsers name the page in `Origin`.
+A web page may drive the player of the computer it is looked at on only with the token, or when it comes
+from that computer itself: browsers name the page in `Origin`.
 """
 
 from __future__ import annotations
