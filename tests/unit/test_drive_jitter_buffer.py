@@ -1,4 +1,4 @@
-"""The buffer of live frames on an accelerated clock: depth, rates, blinks, late frames, jumps of the clock."""
+"""The buffer of live frames on an accelerated clock: depth, rates, blinks, late frames, clock jumps."""
 
 from __future__ import annotations
 
