@@ -1,4 +1,4 @@
-"""A source of frames that come by themselves, played on the display's clock: what a window asks for its face."""
+"""Frames that come by themselves, played on the display's clock: what a window asks for its face."""
 
 from __future__ import annotations
 
