@@ -95,7 +95,10 @@ class LiveStream:
     @property
     def ended(self) -> bool:
         """Whether nothing can come any more, and what came was played."""
-        return self._thread is not None and not self._thread.is_alive() and self.state == "waiting"
+        if self._thread is None or self._thread.is_alive() or self.state != "waiting":
+            return False
+        with self._lock:
+            return not self._buffer.waiting
 
     def frame(self, now: float) -> Frame:
         """The face to show at `now` s."""
