@@ -484,7 +484,7 @@ def add_drive(commands) -> None:
     parser.add_argument(
         "source",
         metavar="SRC",
-        help="fit.npz, vertices .npy, avatar.cap4d (its idle clip), - (NDJSON as it is)",
+        help="fit.npz, vertices .npy, Live Link Face .csv, avatar.cap4d (its idle clip), - (NDJSON)",
     )
     parser.add_argument(
         "--to", required=True, metavar="URL", help="tcp://, udp://, ws:// or livelink://HOST:PORT, or -"
