@@ -14,6 +14,8 @@ from cap4d.errors import exit_code
 
 log = logging.getLogger(__name__)
 
+WINDOW = 1180, 760  # window units, where no size is asked for
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0 success, 1 bad data or no OpenGL, 2 a bad argument, 130 interrupted."""
@@ -49,7 +51,7 @@ def play_in_window(avatar: Path, options: Options) -> bool:
     from cap4d.app.window import DisplayUnavailableError, Window
 
     try:
-        window = Window(f"{avatar.name} - cap4d-view", *options.size)
+        window = Window(f"{avatar.name} - cap4d-view", *(options.size or WINDOW))
     except DisplayUnavailableError as error:
         log.info("%s; rendering offline instead", error)
         return False

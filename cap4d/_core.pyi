@@ -145,8 +145,11 @@ class Splatter:
         background: tuple[float, ...] | None = None,
         vertices: _F32 | None = None,
         threads: int = 0,
+        premultiplied: bool = False,
     ) -> None:
-        """Into out uint8[H, W, 4]: on a background with alpha 255, or without one with straight alpha."""
+        """Into out uint8[H, W, 4]: on a background with alpha 255, else straight unless asked otherwise."""
+    def count(self, out: NDArray[np.uint16], threads: int = 0) -> None:
+        """Into out uint16[H, W]: how many Gaussians each pixel of the last picture takes, hidden ones too."""
     def render(
         self,
         viewmat: _F64,

@@ -1,0 +1,92 @@
+"""The window on a real X server, worked by its real pointer and keyboard."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_bundle import tiny_bundle
+
+from cap4d.bundle import write_bundle
+
+TESTS = Path(__file__).resolve().parents[1]
+
+PROGRAM = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from real_window import WatchedWindow, drag, open_player, pump, pump_for, xdotool
+
+found = {}
+with WatchedWindow("test", 760, 480) as window:
+    player = open_player(window, ["tiny.cap4d", "--deformer", "off"], Path())
+    viewer = player.viewer
+    pump(player, lambda: player.frames > 0)
+    xdotool(player, "mousemove", 300, 200, "click", 1)  # X11 gives the keyboard to no window by itself
+    xdotool(player, "key", "space")
+    found["paused"] = viewer.playback.is_paused
+    before, place = window.picture, player._layout().picture
+    side = player._layout().sidebar
+    bar = side.x + 60, side.y + 151
+    drag(player, bar, (bar[0] + 150, bar[1]))
+    found["held"] = [viewer.expressions[0].name] * bool(viewer.overrides.held[viewer.expressions[0].index])
+    found["value"] = float(viewer.overrides.values[viewer.expressions[0].index])
+    face = np.s_[place.y : place.y + place.height, place.x : place.x + place.width]
+    found["changed"] = int((np.abs(window.picture[face].astype(int) - before[face]) > 16).any(-1).sum())
+    found["orbit before"] = viewer.controls.orbit is not None
+    drag(player, (150, 200), (220, 210))
+    found["orbit after"] = viewer.controls.orbit is not None
+    xdotool(player, "mousemove", 200, 200, "click", 4)
+    found["nearer"] = viewer.controls.orbit.distance
+    xdotool(player, "key", "s")
+    pump(player, lambda: viewer.jobs.label is None)
+    xdotool(player, "key", "v")
+    viewer.playback.toggle(viewer.now)
+    pump_for(player, 0.5)
+    player.input.dropped([Path("broken.cap4d"), Path("tiny.cap4d"), Path("nothing.xyz")])
+    pump(player, lambda: viewer.jobs.label is None)
+    pump_for(player, 0.2)
+    xdotool(player, "key", "v")
+    pump(player, lambda: viewer.jobs.label is None)
+    found["messages"] = [t.text for t in viewer.toasts.current(viewer.now)]
+    xdotool(player, "key", "q")
+    found["closed"] = window.should_close
+    player.close()
+json.dump(found, open("found.json", "w"))
+"""
+
+
+@pytest.mark.skipif(
+    any(shutil.which(name) is None for name in ("xvfb-run", "xauth", "xdotool")),
+    reason="needs xvfb-run, xauth and xdotool (Debian: xvfb xauth xdotool)",
+)
+def test_a_real_pointer_and_keyboard_work_it(tmp_path):
+    write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
+    (tmp_path / "broken.cap4d").write_bytes((tmp_path / "tiny.cap4d").read_bytes()[:3000])
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS / "unit")]),
+        "LIBGL_ALWAYS_SOFTWARE": "1",
+        "XDG_CONFIG_HOME": str(tmp_path / "config"),
+    }
+    run = ["xvfb-run", "-a", "-s", "-screen 0 1280x800x24", sys.executable, "-c", PROGRAM]
+    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=170)
+    if "window: expected OpenGL 4.1" in done.stderr:
+        pytest.skip("the X server has no OpenGL 4.1")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found["paused"]
+    assert found["held"] == ["browInnerUp"]
+    assert 0.4 < found["value"] <= 1
+    assert found["changed"] > 500  # px of the face
+    assert (found["orbit before"], found["orbit after"]) == (False, True)
+    assert (tmp_path / "tiny_0001.png").is_file()
+    assert (tmp_path / "tiny_0001.mp4").stat().st_size > 1000
+    assert any("broken.cap4d" in text for text in found["messages"])
+    assert any("nothing.xyz" in text for text in found["messages"])
+    assert found["closed"]
+    assert json.loads((tmp_path / "config/cap4d/recent.json").read_text()) == [str(tmp_path / "tiny.cap4d")]
