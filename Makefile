@@ -6,7 +6,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check --quiet
-APT_PACKAGES := g++ python3-venv python3-dev libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers libvulkan1 xvfb xauth
+APT_PACKAGES := g++ python3-venv python3-dev libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers libvulkan1 xvfb xauth xdotool chromium
 CPP := CMakeLists.txt pyproject.toml $(wildcard src/cpp/*)
 
 # The C++ again with every access and every conversion checked, in an environment of its own that borrows the packages of the first.

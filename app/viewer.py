@@ -17,8 +17,8 @@ from cap4d.app.expressions import Expression, listed
 from cap4d.app.jobs import Jobs
 from cap4d.app.loading import Loaded, load_avatar, open_playback, with_deformer
 from cap4d.app.orbit import Orbit
-from cap4d.app.overrides import Overrides
 from cap4d.app.overlays.overlays import Overlay, Part
+from cap4d.app.overrides import Overrides
 from cap4d.app.playback import SPEEDS, ClipPlayback, Playback, StreamPlayback
 from cap4d.app.quality import Quality
 from cap4d.app.recent import RecentFiles

@@ -16,7 +16,6 @@ from cap4d.app.renderers import Renderer
 from cap4d.camera import Camera
 from cap4d.player.avatar import Avatar
 
-
 SHARE = 98.0  # per cent of the vertices whose deformation is within the colours
 
 

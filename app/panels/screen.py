@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from cap4d.app.layout import Layout
-from cap4d.app.panels.dialog import Dialog
 from cap4d.app.overlays.legend import Legend
+from cap4d.app.panels.dialog import Dialog
 from cap4d.app.panels.help import HelpPanel
 from cap4d.app.panels.legends import draw_legends
 from cap4d.app.panels.menu import Menu

@@ -9,10 +9,10 @@ pytest.importorskip("onnx")
 
 from dataclasses import replace
 
-from cap4d.app.overlays.color_map import color_map
 from cap4d.app.background import Backdrop, Checkerboard
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.layout import Rect
+from cap4d.app.overlays.color_map import color_map
 from cap4d.app.overlays.legend import Legend, rounded_up, ticks
 from cap4d.app.overlays.overlays import Overlay, Overlays, Part
 from cap4d.app.panels.legends import draw_legends
