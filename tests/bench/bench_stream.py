@@ -1,8 +1,9 @@
 """Live driving: how old pictures are, what a bad line costs, and an hour of hostile senders.
 
-    python -m pytest -m bench -s tests/bench/bench_stream.py
+    OPENBLAS_NUM_THREADS=1 python -m pytest -m bench -s tests/bench/bench_stream.py
 
-The first two are in real time, from another process through a socket; the hour is on a stepped clock.
+The first two are in real time, from another process through a socket; the hour is on a stepped clock. One
+BLAS thread, as the player has it: more of them spin, and keep receiver and renderer from the cores.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def test_a_speech_model_through_a_bad_line(flame, shared: Path, impair: str | No
     with open_live("tcp://127.0.0.1:0", bundle, template=template) as stream:
         send = [sys.executable, "-m", "cap4d.cli", "drive", str(source), "--to", stream.address, "--loop"]
         sender = subprocess.Popen([*send, *(["--impair", impair] if impair else [])])
-        rows = watch(stream, Avatar(bundle), 20, 128)
+        rows = watch(stream, Avatar(bundle), 12, 128)
         found = stream.statistics()
         sender.terminate()
         sender.wait()
@@ -101,8 +102,8 @@ def test_a_speech_model_through_a_bad_line(flame, shared: Path, impair: str | No
     print(
         f"\n{impair or 'a good line'}: arrival to drawn {found['latency_ms']}; {found['received']} received, "
         f"{found['late']} late, {found['dropped']} dropped; {found['interpolated']} of {found['frames']} "
-        f"pictures interpolated, {found['held']} held; expressions off by {error:.4f} rms, {worst:.2f} at worst, "
-        f"of a spread of {truth.std():.3f}"
+        f"pictures interpolated, {found['held']} held; expressions off by {error:.4f} rms, at worst "
+        f"{worst:.2f}, of a spread of {truth.std():.3f}"
     )
     assert error < 0.1 * truth.std() and found["latency_ms"]["median"] < 250
 
