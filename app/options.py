@@ -21,7 +21,12 @@ keys: space pause, left/right step a frame, r reset, h read-out, q or escape qui
 """
 
 
+DRIVE_HELP = (
+    "fit.npz or vertices .npy; or live: - (lines of JSON), tcp://, udp:// or ws://HOST:PORT, livelink://, "
+    "vmc://, webcam://0 (default: the avatar's idle clip)"
+)
 DEFORMERS = ("auto", "full", "fp16", "int8", "linear", "off")
+FPS_HELP = "frames per second of the source, whatever it says itself (live, headless: of the file)"
 DEFORMER_HELP = (
     "how the deformation network is evaluated, as far as the avatar has it (cap4d inspect); auto: the most "
     "exact, in a window the most exact that takes at most 8 ms a frame on this machine (default: auto)"
@@ -61,14 +66,14 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("avatar", nargs="?", type=Path, metavar="AVATAR.cap4d", help="default: the built-in demo avatar")
-    add("--drive", metavar="SRC", help="fit.npz or vertices .npy (default: the avatar's idle clip)")
+    add("--drive", metavar="SRC", help=DRIVE_HELP)
     add(
         "--template",
         type=Path,
         metavar="FILE",
         help="neutral vertices for an .npy (.npy, .npz or .obj)",
     )
-    add("--fps", type=_rate, help="frames per second of the source, whatever it says itself")
+    add("--fps", type=_rate, help=FPS_HELP)
     add("--backend", choices=("auto", "gl", "cpu"), default="auto", help="auto: gl where there is a GPU")
     add("--deformer", choices=DEFORMERS, default="auto", help=DEFORMER_HELP)
     add("--size", type=_size, default=(512, 512), metavar="WxH", help="picture, or window (default: 512x512)")

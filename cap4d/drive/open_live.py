@@ -52,7 +52,8 @@ def open_live(
         raise ArgumentError(f"fps: expected none for a live source, whose frames bear stamps, got {fps:g}")
     if template is not None and spec != "-" and _scheme(spec) not in WIRE:
         raise ArgumentError(f"template: goes with senders of vertices (-, tcp, udp, ws), got {spec}")
-    return LiveStream(_receiver(spec, bundle), Converter(bundle, template=template), fillers)
+    convert = Converter(bundle, template=template)
+    return LiveStream(_receiver(spec, bundle), convert, fillers)
 
 
 @dataclass(frozen=True)
