@@ -89,7 +89,8 @@ class EditionMap:
         chosen = (grid.vertices < N_VERTICES).all(1) & (subject.skin_weights[:, inside].sum(1) < OWN)
         self.rig_name, self.n_expressions = sender.name, sender.n_expressions
         self.keeps_jaw = _has_jaw(sender.name) and _has_jaw(bundle.rig_name)
-        self._sender = sender.resample(grid.vertices[chosen], grid.bary[chosen]).subject()
+        points = sender.resample(grid.vertices[chosen], grid.bary[chosen]).subject()
+        self._sender = points.map(np.ascontiguousarray)  # or every pose would copy the bases
         self._rest = self._sender.pose(np.zeros(self.n_expressions, np.float32))
         self._basis = np.ascontiguousarray(subject.expression_basis[:, chosen]).reshape(
             bundle.n_expressions, -1

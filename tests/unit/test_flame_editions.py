@@ -78,11 +78,7 @@ def another_basis(rig: HeadRig, name: str) -> HeadRig:
     mix, _ = np.linalg.qr(RNG.normal(size=(64, 64)))
     basis = rig.expression_basis.copy()
     basis[:64] = np.tensordot(mix.astype(np.float32), basis[:64], 1)
-    turns = (
-        None
-        if rig.expr_rotation is None
-        else np.concatenate([mix @ rig.expr_rotation[:64], rig.expr_rotation[64:]])
-    )
+    turns = np.concatenate([mix @ rig.expr_rotation[:64], rig.expr_rotation[64:]]).astype(np.float32)
     joints = rig.joints_expression.copy()
     joints[:64] = np.tensordot(mix.astype(np.float32), joints[:64], 1)
     return replace(rig, name=name, expression_basis=basis, expr_rotation=turns, joints_expression=joints)
