@@ -74,7 +74,7 @@ def standin(shared: Path) -> HeadRig:
 
 
 def another_basis(rig: HeadRig, name: str) -> HeadRig:
-    """The same faces by other coefficients: a mixture of the basis, as two editions learnt from like data are."""
+    """The same faces by other coefficients: a mixture of the basis, as of editions learnt from like data."""
     mix, _ = np.linalg.qr(RNG.normal(size=(64, 64)))
     basis = rig.expression_basis.copy()
     basis[:64] = np.tensordot(mix.astype(np.float32), basis[:64], 1)
