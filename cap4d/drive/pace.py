@@ -9,9 +9,9 @@ from __future__ import annotations
 import struct
 
 POURED = 0.5  # s of stream that wait to be read: more than a live sender leaves
-FASTER = 1.01  # than the stamps, so that a live sender who was taken for a file catches up
+FASTER = 1.005  # than the stamps, so that a live sender who was taken for a file catches up
 MAX_STEP = 0.25  # s between two stamps that may be waited for; a longer one is a cut
-MAX_BEHIND = 2.0  # s that a sender who was stopped may catch up at once
+PAUSE = 2.0  # s without a frame; what comes after less was held up, and catches up at once
 LEAST = 5e-3  # s worth waiting
 PIPE = 60_000  # bytes: a pipe that holds so many is full
 
@@ -34,12 +34,9 @@ class Pace:
         """
         if self._last is not None:
             stamps, elapsed = min(max(t - self._last[0], 0.0), MAX_STEP), max(now - self._last[1], 0.0)
-            was_poured, self._poured = (
-                self._poured,
-                waiting > 0 and (self._poured or waiting * stamps > POURED * size),
-            )
-            lead = self._lead + stamps - FASTER * elapsed if was_poured else stamps
-            self._lead = max(lead, -MAX_BEHIND)
+            lead = self._lead if elapsed < PAUSE else FASTER * elapsed
+            self._lead = max(lead + stamps - FASTER * elapsed, -PAUSE)
+            self._poured = waiting > 0 and (self._poured or waiting * stamps > POURED * size)
         self._last = t, now
         return self._lead if self._poured and self._lead > LEAST else 0.0
 

@@ -248,7 +248,7 @@ def test_a_live_stream_of_a_phone_moves_the_face(builtin_rig: HeadRig) -> None:
                 if shown.expr[jaw] > 0.74:
                     break
                 time.sleep(1 / 60)
-    assert np.isclose(shown.expr[jaw], 0.75) and np.count_nonzero(shown.expr) == 1
+    assert np.isclose(shown.expr[jaw], 0.75, atol=0.011) and np.count_nonzero(shown.expr) == 1  # it fades in
 
 
 def test_one_phone_rules_until_it_is_silent() -> None:

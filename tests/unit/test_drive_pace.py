@@ -32,6 +32,23 @@ def test_a_live_sender_is_never_held_back() -> None:
         assert pace.lead(i / 30, i / 30 + delay, size=100, waiting=waiting) == 0
 
 
+def test_what_was_held_up_catches_up_at_once() -> None:
+    pace = Pace()
+    for i in range(100):
+        pace.lead(i / 30, i / 30, size=100, waiting=0)
+    for i in range(100, 145):  # a second and a half of it
+        assert pace.lead(i / 30, 145 / 30, size=100, waiting=100 * (144 - i)) < 0.02
+
+
+def test_what_a_speech_model_sends_at_once_after_a_pause_is_played_at_its_speed() -> None:
+    pace, now = Pace(), 0.0
+    for start in (0.0, 60.0, 65.0):  # utterances of two seconds
+        now = max(now, start)
+        for i in range(60):
+            now += pace.lead(i / 30, now, size=100, waiting=100 * (59 - i))
+        assert now - start == pytest.approx(59 / 30, rel=0.05)
+
+
 def test_a_cut_in_a_file_is_not_waited_for_and_one_that_starts_again_goes_on() -> None:
     pace, now = Pace(), 0.0
     stamps = [0.0, 0.03, 1000.0, 1000.03, 0.0, 0.03]
