@@ -20,7 +20,7 @@ from cap4d.player.video import VideoWriter, check_file, check_output
 
 log = logging.getLogger(__name__)
 
-DEFAULT_FPS = 30.0
+DEFAULT_FPS, DEFAULT_SIZE = 30.0, (512, 512)
 
 
 def record_live(
@@ -38,9 +38,9 @@ def record_live(
     fps = options.fps or DEFAULT_FPS
     if options.stats is not None:
         check_file(options.stats, "stats")
-    cameras = camera_path(options.camera, avatar.camera, head_centre(avatar), fps=fps, size=options.size)
-    several = options.frames or 2
-    check_output(Path(out), fps=fps, frames=several, size=options.size)
+    size, several = options.size or DEFAULT_SIZE, options.frames or 2
+    cameras = camera_path(options.camera, avatar.camera, head_centre(avatar), fps=fps, size=size)
+    check_output(Path(out), fps=fps, frames=several, size=size)
     player = _Player(avatar, stream, cameras, draw)
     player.draw(0)  # loads what the others find loaded
     avatar.stages.clear()
@@ -53,7 +53,13 @@ def record_live(
         except KeyboardInterrupt:
             log.info("interrupted: the file ends here")
         seconds = time.perf_counter() - start
-    return _finish(avatar, stream, options, backend, clock, writer.frames, seconds)
+    drive = stream.statistics()
+    counts = dict(dropped=clock.dropped, late=drive["late"])
+    stats = statistics(avatar, writer.frames, seconds, size=size, backend=backend, **counts)
+    stats["drive"] = drive
+    if options.stats is not None:
+        write_stats(options.stats, stats)
+    return stats
 
 
 class _Player:
@@ -84,28 +90,3 @@ class _Player:
         self.stream.shown(time.monotonic())
         self.avatar.stages.add("frame", time.perf_counter() - start)
         return np.ascontiguousarray(image[..., :3])
-
-
-def _finish(
-    avatar: Avatar,
-    stream: LiveStream,
-    options: Options,
-    backend: str,
-    clock: PlayClock,
-    frames: int,
-    seconds: float,
-) -> dict[str, Any]:
-    drive = stream.statistics()
-    stats = statistics(
-        avatar,
-        frames,
-        seconds,
-        size=options.size,
-        backend=backend,
-        dropped=clock.dropped,
-        late=drive["late"],
-    )
-    stats["drive"] = drive
-    if options.stats is not None:
-        write_stats(options.stats, stats)
-    return stats

@@ -14,6 +14,11 @@ right.
 
 An edition's neutral face may have its lips apart; Apple's has not. `rest` then says how far Apple's jaw is
 open in it, so that weights of zero close them.
+
+Measured on FLAME's mesh, root mean square over the points that a shape moves, mean over the shapes: 0.14 mm
+with a basis of 64 components that was learnt from faces (`jawOpen`, which moves 13 mm, 0.3 mm); 0.3 mm with
+one that has not seen jaws and a jaw joint instead (`jawOpen` 3.7 mm). The licensed bases are yet to be
+measured.
 """
 
 from __future__ import annotations

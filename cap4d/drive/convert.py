@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ import numpy as np
 from cap4d.bundle.bundle import Bundle
 from cap4d.drive.arkit import ArkitMap, arkit_map
 from cap4d.drive.clip import Frame
-from cap4d.drive.flame_editions import convert_expression
+from cap4d.drive.flame_editions import EditionMap, convert_expression, same_basis
 from cap4d.drive.packet import Cause, Packet, Rejected
 from cap4d.drive.retarget import Retargeter
 from cap4d.drive.vertices import expected_vertices, read_template
 from cap4d.errors import ArgumentError
 from cap4d.rig.flame import RELEASED_RIG
+from cap4d.rig.head import HeadRig
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +26,7 @@ MAX_RESIDUAL_MM = (
 )
 MAX_OFFSET = 0.5  # m of a vertex from the neutral face: beyond it the mesh is in other units or another place
 REACH = 2.0  # expressions are kept within their range and this many times its width beyond
+MAX_COMPONENT = 15.0  # of another FLAME's expressions, which have unit variance
 MAX_TURN = np.pi  # rad
 MAX_WEIGHT = 2.0  # of Apple's, which are 0 to 1
 MAX_DISTANCE = np.float32(100.0)  # m
@@ -40,21 +43,25 @@ class Converter:
         bundle: The avatar.
         template: Neutral vertices of whoever sends vertices: float32[V, 3] m or a file, see `read_template`;
             None: their first frame is taken for it.
+        sender: The rig of whoever sends expressions of another edition of FLAME; None: those are refused.
     Raises:
         ArgumentError, DataError: The template is of another topology, or not sound.
 
     Attributes:
-        residual_mm: What the last frame of vertices moved beyond what the avatar's expressions can, root mean
-            square over its points; None before the first.
+        residual_mm: What the last frame of vertices, or of another edition, moved beyond what the avatar's
+            expressions can, root mean square over its points; None before the first.
     """
 
-    def __init__(self, bundle: Bundle, *, template: np.ndarray | Path | None = None) -> None:
+    def __init__(
+        self, bundle: Bundle, *, template: np.ndarray | Path | None = None, sender: HeadRig | None = None
+    ) -> None:
         self._bundle = bundle
         self._names = bundle.subject.expression_names
         low, high = bundle.expression_range.T.astype(np.float32)
         self._low, self._high = low - REACH * (high - low), high + REACH * (high - low)
         self._arkit: ArkitMap | str | None = None  # a text: why there is none
         self._retargeter: Retargeter | str | None = None
+        self._edition = None if sender is None else EditionMap(sender, bundle)
         self._template = self._read(template)
         self.residual_mm: float | None = None
         if self._template is not None:
@@ -72,7 +79,7 @@ class Converter:
         elif packet.arkit is not None:
             expr, turns = self._from_arkit(packet.arkit)
         else:
-            expr, turns = self._from_expressions(packet), {}
+            (expr, packet), turns = self._from_expressions(packet), {}
         return self._frame(packet, expr, turns)
 
     def neutral(self, t: float = 0.0) -> Frame:
@@ -98,11 +105,21 @@ class Converter:
             tra=None if tra is None else np.clip(_finite("tra", tra, 3), -MAX_DISTANCE, MAX_DISTANCE),
         )
 
-    def _from_expressions(self, packet: Packet) -> np.ndarray:
+    def _from_expressions(self, packet: Packet) -> tuple[np.ndarray, Packet]:
+        """The avatar's expressions, and the packet less a jaw that they have taken over."""
         if packet.expr is None or packet.expr.ndim != 1:
             raise Rejected(Cause.FIELD, "expr: expected a list of numbers")
         rig_name = packet.rig_name or RELEASED_RIG  # what names no rig is the released system's (fact 46)
-        return convert_expression(packet.expr, rig_name, self._bundle.rig_name, self._names)
+        edition, target = self._edition, self._bundle.rig_name
+        if edition is None or edition.rig_name != rig_name or same_basis(rig_name, target):
+            return convert_expression(packet.expr, rig_name, target, self._names), packet
+        if not 0 < len(packet.expr) <= edition.n_expressions:
+            expected = f"expr: expected at most {edition.n_expressions} numbers"
+            raise Rejected(Cause.SHAPE, f"{expected}, got {len(packet.expr)}")
+        jaw_rot = _turn("jaw_rot", packet.jaw_rot)
+        sent = np.clip(_finite("expr", packet.expr), -MAX_COMPONENT, MAX_COMPONENT)
+        expr, self.residual_mm = edition(sent, jaw_rot)
+        return expr, packet if edition.keeps_jaw else replace(packet, jaw_rot=None)
 
     def _from_arkit(self, weights: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         arkit = self._arkit_map()

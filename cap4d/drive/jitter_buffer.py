@@ -37,6 +37,7 @@ NOWHERE = float("-inf")
 class _Entry:
     t: float
     arrival: float
+    ready: float
     frame: Frame
     done: bool = False  # counted as shown or as dropped
 
@@ -91,13 +92,18 @@ class JitterBuffer:
         """s that a frame waits here: the middle one of the recent ones."""
         return self._offset - self.transit.median if len(self.transit) else 0.0
 
-    def push(self, frame: Frame, arrival: float) -> None:
-        """A frame that arrived, at `arrival` s on the display's clock."""
-        entry = _Entry(frame.t, arrival, frame)
-        if self.transit.is_stale(arrival):
+    def push(self, frame: Frame, arrival: float, ready: float | None = None) -> None:
+        """A frame that arrived, at `arrival` s on the display's clock.
+
+        Args:
+            ready: When it had been converted, s; what is waited for. None: at once.
+        """
+        ready = arrival if ready is None else ready
+        entry = _Entry(frame.t, arrival, ready, frame)
+        if self.transit.is_stale(ready):
             self._settle()
             self._restart([entry])
-        elif self.transit.fits(entry.t, arrival):
+        elif self.transit.fits(entry.t, ready):
             self._settle()
             self._insert(entry)
         elif any(other.t == entry.t for other in self._doubted):
@@ -178,10 +184,10 @@ class JitterBuffer:
         at = self._after(entry.t)
         if at and self._entries[at - 1].t == entry.t:
             return self._refuse(Cause.DUPLICATE)
-        self.transit.add(entry.t, entry.arrival)
+        self.transit.add(entry.t, entry.ready)
         if entry.t <= self._position:
             return self._refuse(Cause.LATE)
-        self.overdue += entry.t < entry.arrival - self._offset and self._position > NOWHERE
+        self.overdue += entry.t < entry.ready - self._offset and self._position > NOWHERE
         self._entries.insert(at, entry)
         if len(self._entries) > MAX_FRAMES:
             self._drop(self._entries[:1])
@@ -193,7 +199,7 @@ class JitterBuffer:
         if self._doubted and abs(_transit(entry) - _transit(self._doubted[-1])) > AGREE:
             self._settle()
         self._doubted.append(entry)
-        if len(self._doubted) >= NEW_CLOCK and entry.arrival - self._doubted[0].arrival >= NEW_CLOCK_TIME:
+        if len(self._doubted) >= NEW_CLOCK and entry.ready - self._doubted[0].ready >= NEW_CLOCK_TIME:
             self._restart(self._doubted)
         elif len(self._doubted) > MAX_DOUBTED:
             self._settle()
@@ -215,7 +221,7 @@ class JitterBuffer:
         self.clocks += 1
         self.transit.clear()
         for entry in entries:
-            self.transit.add(entry.t, entry.arrival)
+            self.transit.add(entry.t, entry.ready)
 
     def _after(self, t: float) -> int:
         """Index of the first frame later than `t`."""
@@ -255,4 +261,4 @@ def _between(a: _Entry, b: _Entry, t: float) -> Moment:
 
 
 def _transit(entry: _Entry) -> float:
-    return entry.arrival - entry.t
+    return entry.ready - entry.t

@@ -170,7 +170,7 @@ class LiveStream:
         with self._lock:
             self._counts.receive()
             self._last_arrival = max(self._last_arrival, arrival)
-            self._buffer.push(frame, arrival)
+            self._buffer.push(frame, arrival, max(arrival, self.clock()))
         return True
 
     def rejected(self, cause: Cause, detail: str = "", *, times: int = 1) -> None:

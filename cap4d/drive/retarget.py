@@ -15,7 +15,7 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError
 from cap4d.rig.head import Subject
-from cap4d.rotation import rotmat_to_axis_angle
+from cap4d.rotation import axis_angle_to_rotmat, rotmat_to_axis_angle
 
 NOISE = 3e-5  # m per coordinate: motion below it is not worth an expression of 1 (the ridge)
 MIN_EYE_POINTS = 20
@@ -64,8 +64,8 @@ class Retargeter:
                 f"vertices: expected a mesh that covers the avatar's, got {still.sum()} points of it"
             )
         self._vertices, self._bary = grid.vertices[still], grid.bary[still]
-        self._subject = _points_of(subject, still)
-        self._basis = _by_axis(self._subject.expression_basis).reshape(bundle.n_expressions, -1)
+        self._basis = _by_axis(subject.expression_basis[:, still]).reshape(bundle.n_expressions, -1)
+        self._lids = _Lids(subject, still)
         normal = self._basis.astype(np.float64) @ self._basis.T.astype(np.float64)
         normal += noise**2 * np.eye(len(normal))
         self._expr_from_motion = np.linalg.solve(normal, self._basis.astype(np.float64)).astype(np.float32)
@@ -90,8 +90,7 @@ class Retargeter:
         expr = motion @ self._expr_from_motion.T
         eye_rot = self._gaze(vertices, template, expr)
         if eye_rot.any():  # lids follow the eyes without an expression: take that motion away and solve again
-            with_gaze, without = self._subject.pose(expr, eye_rot=eye_rot), self._subject.pose(expr)
-            motion = motion - _by_axis(with_gaze - without).reshape(motion.shape)
+            motion = motion - self._lids(expr, eye_rot)
             expr = motion @ self._expr_from_motion.T
         left = motion - expr @ self._basis
         return expr, eye_rot, 1e3 * np.sqrt(3 * np.einsum("ti,ti->t", left, left) / left.shape[1])
@@ -126,14 +125,47 @@ class _EyePoints:
         return cls(vertices, bary, _by_axis(basis).reshape(len(basis), -1))
 
 
-def _points_of(subject: Subject, mask: np.ndarray) -> Subject:
-    """The subject on some of its points."""
-    changes = {
-        name: getattr(subject, name)[..., mask, :] for name in ("neutral", "expression_basis", "skin_weights")
-    }
-    for name in ("pose_basis", "pose_offset"):
-        if getattr(subject, name) is not None:
-            changes[name] = getattr(subject, name)[..., mask, :]
+class _Lids:
+    """How points of the skin go with the eyes: little skin weights, and FLAME's pose correctives.
+
+    Args:
+        subject: The head.
+        mask: bool[G] its P points.
+    """
+
+    def __init__(self, subject: Subject, mask: np.ndarray) -> None:
+        self._eyes = [j for j, driver in enumerate(subject.joint_drivers) if driver == "eyes"]
+        weights = subject.skin_weights[mask][:, self._eyes]
+        near = np.flatnonzero(weights.any(1))
+        chosen = np.flatnonzero(mask)[near]
+        self._near, self._weights = near, weights[near]
+        self._subject = _points_of(subject, chosen)
+        self._joints = subject.joints[self._eyes], subject.joints_expression[:, self._eyes]
+        self._count, self._correctives = int(mask.sum()), None
+        if subject.pose_basis is not None:
+            rows = [9 * j + entry for j in self._eyes for entry in range(9)]
+            self._correctives = _by_axis(subject.pose_basis[rows][:, mask]).reshape(len(rows), -1)
+
+    def __call__(self, expr: np.ndarray, eye_rot: np.ndarray) -> np.ndarray:
+        """float32[T, 3 P] by axis: posed with `eye_rot` [T, 3] less posed without."""
+        turn = axis_angle_to_rotmat(eye_rot) - np.eye(3, dtype=np.float32)
+        moved = np.zeros((len(expr), 3, self._count), np.float32)
+        if self._correctives is not None:
+            entries = np.tile(turn.reshape(-1, 9), len(self._eyes))
+            moved = (entries @ self._correctives).reshape(moved.shape)
+        at = self._subject.pose(expr) + moved[..., self._near].swapaxes(-1, -2)
+        joints = self._joints[0] + np.tensordot(expr, self._joints[1], 1)
+        for k in range(len(self._eyes)):
+            arm = (at - joints[:, k : k + 1]) @ turn.swapaxes(-1, -2)
+            moved[..., self._near] += (self._weights[:, k, None] * arm).swapaxes(-1, -2)
+        return moved.reshape(len(expr), -1)
+
+
+def _points_of(subject: Subject, chosen: np.ndarray) -> Subject:
+    """The subject on some of its points; contiguous, or every pose would copy the bases."""
+    names = ("neutral", "expression_basis", "skin_weights", "pose_basis", "pose_offset")
+    values = {name: getattr(subject, name) for name in names}
+    changes = {n: np.ascontiguousarray(v[..., chosen, :]) for n, v in values.items() if v is not None}
     return replace(subject, **changes)
 
 

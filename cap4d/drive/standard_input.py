@@ -8,10 +8,10 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from cap4d.drive.gate import Gate
-from cap4d.drive.pace import Pace
+from cap4d.drive.pace import PIPE, Pace, unread
 from cap4d.drive.packet import Cause, Sink
 from cap4d.drive.wire import LineSplitter
 
@@ -38,10 +38,10 @@ class StandardInputReceiver:
         for data in self._chunks(stop):
             lines = deque(splitter.feed(data))
             while lines and not stop.is_set():
-                now = self._clock()
-                t = gate.line(self, lines.popleft(), now)
-                if t is not None and (lead := pace.lead(t, now)) and (lines or self._has_more(0.0)):
-                    stop.wait(lead)
+                now, line = self._clock(), lines.popleft()
+                t = gate.line(self, line, now)
+                if t is not None:
+                    stop.wait(pace.lead(t, now, size=len(line), waiting=self._waiting(lines)))
                 elif gate.flooded:
                     sink.rejected(Cause.FLOOD, times=len(lines))
                     lines.clear()
@@ -54,6 +54,11 @@ class StandardInputReceiver:
                 yield data or b"\n"
                 if not data:
                     return
+
+    def _waiting(self, lines: Iterable[bytes | None]) -> float:
+        """Bytes that nobody has looked at; a pipe that is full may stand for any number."""
+        in_pipe = unread(self._file)
+        return float("inf") if in_pipe >= PIPE else in_pipe + sum(len(line or b"") for line in lines)
 
     def _has_more(self, timeout: float) -> bool:
         """Whether reading would not wait. Windows cannot tell: there the thread waits."""

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 
 from cap4d.drive.gate import Gate
-from cap4d.drive.pace import Pace
+from cap4d.drive.pace import Pace, unread
 from cap4d.drive.packet import Cause, Rejected, Sink
 from cap4d.drive.wire import LineSplitter, check_token, parse_object
 from cap4d.errors import ArgumentError
@@ -80,6 +80,10 @@ class _Connection:
             return
         self.ended = not data
         self.lines.extend(self.splitter.feed(data or b"\n"))
+
+    def waiting(self) -> int:
+        """Bytes that nobody has looked at."""
+        return sum(len(line or b"") for line in self.lines) + unread(self.sock.fileno())
 
     def is_dead(self, now: float) -> bool:
         """Whether it has been silent for longer than a sender is."""
@@ -160,8 +164,9 @@ class _Server:
             elif not self.gate.rules(connection, now):
                 raise Rejected(Cause.SENDER, "another one sends already")
             elif (t := self.gate.line(connection, line, now)) is not None:
-                lead = connection.pace.lead(t, now)
-                connection.until = now + lead if connection.lines else now
+                connection.until = now + connection.pace.lead(
+                    t, now, size=len(line), waiting=connection.waiting()
+                )
             elif self.gate.flooded:
                 self.sink.rejected(Cause.FLOOD, times=len(connection.lines))
                 connection.lines.clear()

@@ -1,10 +1,10 @@
 """How long frames are on their way: what decides when a live stream's moments are played.
 
-A frame with stamp `t` that arrives at `a` has the transit `a - t`: the network's delay, plus a constant
-nobody knows, the difference of two clocks. Playing moment `t` at `t + offset` shows every frame whose transit
-is at most `offset`. The offset aimed at is the 98th percentile of the recent transits, plus the time between
-two frames, so that there is a frame on each side to interpolate between: the percentile rule of Moon, Kurose
-and Towsley 1998 ("Packet audio playout delay adjustment"). As it is a percentile of `a - t`
+A frame with stamp `t` that is there (converted) at `a` has the transit `a - t`: the network's delay, plus a
+constant nobody knows, the difference of two clocks. Playing moment `t` at `t + offset` shows every frame
+whose transit is at most `offset`. The offset aimed at is the 98th percentile of the recent transits, plus the
+time between two frames, so that there is a frame on each side to interpolate between: the percentile rule of
+Moon, Kurose and Towsley 1998 ("Packet audio playout delay adjustment"). As it is a percentile of `a - t`
 itself, no clock needs estimating: a drifting sender moves the window, and the offset with it. Frames that
 were held up and let go together count once, as the one event they are: one stall leaves no delay behind.
 """

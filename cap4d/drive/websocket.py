@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 from cap4d.drive.gate import Gate
-from cap4d.drive.pace import Pace
+from cap4d.drive.pace import Pace, unread
 from cap4d.drive.packet import Cause, Sink
 from cap4d.drive.tcp import FLOODED, GREETING, IDLE, MAX_CONNECTIONS, authority, listen
 from cap4d.drive.wire import MAX_LINE, same_token
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 POLL = 0.1  # s
-AHEAD = 0.25  # s; whether more waits to be read is not known here, so what is less may be jitter
 LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 TRY_AGAIN_LATER, POLICY = 1013, 1008  # close codes, RFC 6455 7.4.1 and IANA's registry
 
@@ -137,15 +136,17 @@ class _Visitors:
             lines = deque(line for line in message.split(b"\n") if line.strip())
             while lines:
                 now = self.clock()
-                t = self.gate.line(connection, lines.popleft(), now)
+                line = lines.popleft()
+                t = self.gate.line(connection, line, now)
                 if not self.gate.rules(connection, now):
                     return await connection.close(TRY_AGAIN_LATER, "another one sends already")
                 if self.gate.flooded:
                     self.sink.rejected(Cause.FLOOD, times=len(lines))
                     lines.clear()
                     await asyncio.sleep(FLOODED)
-                elif t is not None and (lead := pace.lead(t, now) - AHEAD) > 0:
-                    await asyncio.sleep(lead)
+                elif t is not None:
+                    waiting = unread(connection.transport.get_extra_info("socket").fileno())
+                    await asyncio.sleep(pace.lead(t, now, size=len(line), waiting=waiting))
 
 
 def _token(request: Request) -> str | None:

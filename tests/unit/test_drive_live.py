@@ -75,6 +75,26 @@ def test_what_is_sent_is_shown_and_the_numbers_say_how() -> None:
     assert found["rate"] == 60 and found["interpolated"] > 590 and found["held"] == 0
 
 
+def test_a_slow_conversion_is_waited_for_and_is_part_of_the_latency() -> None:
+    clock = [100.0]
+
+    class Slow(Own):
+        def __call__(self, packet: Packet) -> Frame:
+            clock[0] += 0.02
+            return super().__call__(packet)
+
+    live = LiveStream(Silent(), Slow(), clock=lambda: clock[0])
+    for i in range(300):
+        arrival = clock[0] = 100 + i / 30
+        live.packet(packet(i / 30), arrival)
+        for tick in (0.021, 0.032):
+            live.frame(arrival + tick)
+            live.shown(arrival + tick)
+    found = live.statistics()
+    assert found["held"] == 0 and found["late"] == 0 and found["interpolated"] > 590
+    assert found["latency_ms"]["median"] == pytest.approx(33.3 + 2 + 20, rel=0.03)
+
+
 def test_every_refused_frame_is_counted_by_its_cause(caplog) -> None:
     live = stream()
     assert live.packet(packet(0.0), 100.0)

@@ -6,6 +6,7 @@ import contextlib
 import socket
 import struct
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from cap4d.bundle import Bundle
 from cap4d.drive.arkit import COLUMN, NAMES
 from cap4d.drive.convert import Converter
 from cap4d.drive.livelink import ANGLES, MAX_PACKET, LiveLinkReceiver, parse_livelink
+from cap4d.drive.open_live import open_live
 from cap4d.drive.packet import Cause, Packet, Rejected
 from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError, DataError
@@ -230,6 +232,23 @@ def test_through_a_real_socket() -> None:
     assert not thread.is_alive() and receiver.address.startswith("livelink://127.0.0.1:")
     assert [p.arkit[COLUMN["jawOpen"]] for p in sink.packets] == [0, 0.25, 0.5]
     assert np.allclose([p.t for p in sink.packets], np.arange(3) / 60) and sink.causes == [Cause.SYNTAX]
+
+
+def test_a_live_stream_of_a_phone_moves_the_face(builtin_rig: HeadRig) -> None:
+    """The whole road: datagrams, buffer, conversion; in real time."""
+    bundle = on_rig(builtin_rig, size=32)
+    jaw = bundle.subject.expression_names.index("jawOpen")
+    with open_live("livelink://127.0.0.1:0", bundle) as stream:
+        port = int(stream.address.rpartition(":")[2])
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
+            for frame in range(300):
+                data = packet(values_of(JawOpen=0.75), frame=frame, part=0)
+                phone.sendto(data, ("127.0.0.1", port))
+                shown = stream.frame(time.monotonic())
+                if shown.expr[jaw] > 0.74:
+                    break
+                time.sleep(1 / 60)
+    assert np.isclose(shown.expr[jaw], 0.75, atol=0.011) and np.count_nonzero(shown.expr) == 1  # it fades in
 
 
 def test_one_phone_rules_until_it_is_silent() -> None:

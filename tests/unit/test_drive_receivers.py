@@ -313,10 +313,10 @@ def test_standard_input_stops_though_nothing_comes() -> None:
 
 def test_standard_input_plays_a_file_at_its_own_speed() -> None:
     with piped() as (receiver, write, close), running(receiver) as sink:
-        write(b"".join(line(i / 100) for i in range(50)))
+        write(b"".join(line(i / 100) for i in range(100)))
         close()
-        sink.until(lambda: len(sink.packets) == 50)
-        assert sink.arrivals[-1] - sink.arrivals[0] > 0.45
+        sink.until(lambda: len(sink.packets) == 100)
+        assert sink.arrivals[-1] - sink.arrivals[0] > 0.9
 
 
 # WebSocket ----------------------------------------------------------------------------------------
