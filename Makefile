@@ -14,8 +14,8 @@ CPP := CMakeLists.txt pyproject.toml $(wildcard src/cpp/*)
 SANITIZED := build/sanitize
 SANITIZERS := -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer -g -O1
 SANITIZED_TESTS := $(wildcard tests/property/test_hard_*.py) $(addprefix tests/,$(addsuffix .py,property/test_splatting_gradients \
-  $(addprefix parity/test_,player quantized_answers splatting) \
-  $(addprefix unit/test_,avatar_bound bench_floor bind mesh player_avatar player_tiers quantized_unet raster render sort splatter)))
+  $(addprefix parity/test_,float_answers player quantized_answers splatting) \
+  $(addprefix unit/test_,avatar_bound bench_floor bind float_unet mesh player_avatar player_tiers quantized_unet raster render sort splatter)))
 
 .PHONY: demo test bench lint sanitize sanitize-base sanitize-v3 sanitize-v4 sanitize-threads clean
 .DELETE_ON_ERROR:

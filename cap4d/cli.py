@@ -450,6 +450,7 @@ def add_render(commands) -> None:
     parser.add_argument(
         "--pipeline", action="store_true", help="work out the next frame's face while a frame is drawn"
     )
+    parser.add_argument("--audio", type=Path, metavar="FILE.wav", help="the sound of out.mp4")
     parser.add_argument("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
 
 
@@ -469,6 +470,7 @@ def run_render(arguments: argparse.Namespace) -> None:
         stats=arguments.stats,
         deformer=arguments.deformer,
         pipelined=arguments.pipeline,
+        audio=arguments.audio,
     )
 
 
@@ -484,7 +486,7 @@ def add_drive(commands) -> None:
     parser.add_argument(
         "source",
         metavar="SRC",
-        help="fit.npz, vertices .npy, avatar.cap4d (its idle clip), - (NDJSON as it is)",
+        help="fit.npz, vertices .npy, Live Link Face .csv, avatar.cap4d (its idle clip), - (NDJSON)",
     )
     parser.add_argument(
         "--to", required=True, metavar="URL", help="tcp://, udp://, ws:// or livelink://HOST:PORT, or -"

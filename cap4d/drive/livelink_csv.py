@@ -40,17 +40,26 @@ def read_livelink_csv(path: Path, bundle: Bundle, *, fps: float | None = None) -
         DataError: Not such a recording.
     """
     convert = arkit_map(bundle)
+    rate, even = read_values(path, fps=fps)
+    expr, eye_rot, jaw_rot = convert(even[:, : len(NAMES)])
+    zeros = np.zeros((len(even), 3), np.float32)
+    pose = {"eye_rot": eye_rot, "neck_rot": zeros} | pose_of_angles(even[:, len(NAMES) :])
+    return Clip(bundle.rig_name, rate, expr.astype(np.float32), jaw_rot=jaw_rot.astype(np.float32), **pose)
+
+
+def read_values(path: Path, *, fps: float | None = None) -> tuple[float, np.ndarray]:
+    """A recording in its own terms: (rate, float32[T, 61]), the order of `NAMES` and `ANGLES`; see above.
+
+    Raises:
+        DataError: Not such a recording.
+    """
     times, values = _read(path, fps)
     rate = fps or _rate(times)
     count = round((times[-1] - times[0]) * rate) + 1
     if count > MAX_FRAMES:
         raise DataError(path, "Timecode", expected=f"at most {MAX_FRAMES} frames", found=count)
     wanted = times[0] + np.arange(count) / rate
-    even = np.stack([np.interp(wanted, times, column) for column in values.T], 1).astype(np.float32)
-    expr, eye_rot, jaw_rot = convert(even[:, : len(NAMES)])
-    zeros = np.zeros((count, 3), np.float32)
-    pose = {"eye_rot": eye_rot, "neck_rot": zeros} | pose_of_angles(even[:, len(NAMES) :])
-    return Clip(bundle.rig_name, rate, expr.astype(np.float32), jaw_rot=jaw_rot.astype(np.float32), **pose)
+    return rate, np.stack([np.interp(wanted, times, column) for column in values.T], 1).astype(np.float32)
 
 
 def _read(path: Path, fps: float | None) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,4 @@
-"""A packet of Live Link Face, version 6, as the phone sends it: big-endian.
-
-u8 6 | u32 length, device id | u32 length, subject name | i32 frame, f32 part of a frame, i32 rate, i32 per
-u8 61 | f32[61]: ARKit's 52 weights, then yaw, pitch and roll of the head, the left and the right eye
-"""
+"""A packet of Live Link Face, as the app sends it: what `livelink.parse_livelink` reads, the other way."""
 
 from __future__ import annotations
 
@@ -10,18 +6,34 @@ import struct
 
 import numpy as np
 
+from cap4d.drive.livelink import TIME, VALUES, VERSION
 from cap4d.drive.packet import Packet
+from cap4d.rotation import axis_angle_to_rotmat
 
-VERSION = 6
-VALUES, ANGLES = 61, 9
 RATE = 60  # frames a second of the time code
 
 
 def format_livelink(packet: Packet, *, device: str = "cap4d", subject: str = "cap4d") -> bytes:
-    """The packet of `arkit` weights. The angles are zero: gaze is in the weights."""
+    """The packet of `arkit` weights, gaze, and how the head turns, where it has no place (`tra`) besides."""
     position = packet.t * RATE
     frame = int(np.floor(position))
     words = b"".join(struct.pack(">I", len(word)) + word for word in (device.encode(), subject.encode()))
-    time = struct.pack(">ifii", frame, position - frame, RATE, 1)
-    values = np.concatenate([packet.arkit, np.zeros(ANGLES)]).astype(">f4").tobytes()
+    values = np.concatenate([packet.arkit, angles_of_pose(packet)]).astype(">f4").tobytes()
+    time = TIME.pack(frame, position - frame, RATE, 1)
     return struct.pack(">B", VERSION) + words + time + struct.pack(">B", VALUES) + values
+
+
+def angles_of_pose(packet: Packet) -> np.ndarray:
+    """[9] rad, the app's yaw, pitch and roll of the head and of both eyes; see `livelink.pose_of_angles`."""
+    turns = packet.rot is not None and (packet.tra is None or not packet.tra.any())
+    head = _angles(packet.rot) if turns else np.zeros(3)
+    eyes = np.zeros(3) if packet.eye_rot is None else _angles(packet.eye_rot) * [1, 1, 0]
+    return np.concatenate([head, eyes, eyes])
+
+
+def _angles(rot: np.ndarray) -> np.ndarray:
+    """Axis-angle -> (yaw, pitch, roll) whose `head_turn.turn(-yaw, pitch, -roll)` it is."""
+    matrix = axis_angle_to_rotmat(np.asarray(rot, np.float64))
+    pitch = np.arcsin(np.clip(-matrix[1, 2], -1, 1))
+    yaw, roll = np.arctan2(matrix[0, 2], matrix[2, 2]), np.arctan2(matrix[1, 0], matrix[1, 1])
+    return np.array([-yaw, pitch, -roll])

@@ -13,14 +13,16 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.drive.arkit import NAMES
 from cap4d.drive.clip import Clip
 from cap4d.drive.fit import read_sequence
+from cap4d.drive.livelink import pose_of_angles
+from cap4d.drive.livelink_csv import read_values
 from cap4d.drive.packet import Packet
 from cap4d.drive.vertices import VERTEX_FPS, expected_vertices, read_vertices
 from cap4d.errors import ArgumentError
 
 Form = Literal["expr", "arkit", "vertices"]
 FORMS: tuple[Form, ...] = get_args(Form)
-OWN_FORMS: dict[str, Form] = {".npz": "expr", ".npy": "vertices", ".cap4d": "expr"}
-SOURCES = "a fit.npz, vertices in an .npy, an avatar.cap4d, or -"
+OWN_FORMS: dict[str, Form] = {".npz": "expr", ".npy": "vertices", ".csv": "arkit", ".cap4d": "expr"}
+SOURCES = "a fit.npz, vertices in an .npy, a Live Link Face recording (.csv), an avatar.cap4d, or -"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ def open_recording(
     """Opens a file to send.
 
     Args:
-        spec: `*.npz` or `*.npy` as of `open_source`, or `*.cap4d`: its idle clip.
+        spec: `*.npz`, `*.npy` or `*.csv` as of `open_source`, or `*.cap4d`: its idle clip.
         form: How it is said; None: as the file has it.
         avatar: Whose rig translates into another form. An `*.cap4d` is its own.
         template: Neutral vertices of an `.npy`, to translate it; as of `open_source`.
@@ -73,6 +75,8 @@ def _untranslated(path: Path, fps: float | None) -> Recording:
         return clip_recording(read_sequence(path, fps=fps))
     if path.suffix == ".npy":
         return vertex_recording(read_vertices(path, None), fps or VERTEX_FPS)
+    if path.suffix == ".csv":
+        return livelink_recording(*read_values(path, fps=fps))
     return clip_recording(_idle(path, fps)[1])
 
 
@@ -142,6 +146,16 @@ def arkit_from_expr(names: tuple[str, ...]) -> np.ndarray:
             f"as: expected a rig with ARKit's {len(NAMES)} names, got one with {found} of them"
         )
     return matrix
+
+
+def livelink_recording(rate: float, values: np.ndarray) -> Recording:
+    """float32[T, 61] as of `livelink_csv.read_values`, as they are."""
+    weights, pose = values[:, : len(NAMES)], pose_of_angles(values[:, len(NAMES) :])
+
+    def packet(i: int, t: float) -> Packet:
+        return Packet(t, arkit=weights[i], **{name: value[i] for name, value in pose.items()})
+
+    return Recording("arkit", rate, len(values), packet)
 
 
 def vertex_recording(vertices: np.ndarray, fps: float) -> Recording:

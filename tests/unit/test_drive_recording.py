@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from cap4d.drive.arkit import NAMES
+from cap4d.drive.livelink import ANGLES, parse_livelink
+from cap4d.drive.livelink_format import format_livelink
 from cap4d.drive.recording import arkit_from_expr, open_recording, posed_recording
 from cap4d.drive.vertices import VERTEX_FPS
 from cap4d.errors import ArgumentError, DataError
@@ -55,6 +57,21 @@ def test_a_ragged_array_of_vertices_is_refused(tmp_path):
     np.save(tmp_path / "v.npy", np.zeros((T, 20), np.float32))
     with pytest.raises(DataError, match="vertices"):
         open_recording(str(tmp_path / "v.npy"))
+
+
+def test_a_live_link_recording_is_sent_as_it_is(tmp_path):
+    rng, names = np.random.default_rng(0), (*NAMES, *ANGLES)
+    values = rng.random((5, len(names))).astype(np.float32)
+    rows = [f"10:00:00:{i:02d}.0,61," + ",".join(map(str, row)) for i, row in enumerate(values)]
+    path = tmp_path / "face.csv"
+    path.write_text("\n".join([f"Timecode,BlendShapeCount,{','.join(names)}", *rows]) + "\n")
+    recording = open_recording(str(path), fps=60)
+    assert (recording.form, recording.fps, recording.count) == ("arkit", 60.0, 5)
+    packet = recording.packet(2, 0.5)
+    np.testing.assert_allclose(packet.arkit, values[2, :52], atol=1e-6)
+    assert packet.eye_rot is not None and packet.rot is not None
+    again = parse_livelink(format_livelink(packet))  # over the wire that it came from
+    np.testing.assert_allclose(again.rot, packet.rot, atol=1e-6)
 
 
 def test_arkit_weights_are_their_namesakes_or_the_mean_of_two_sides():

@@ -19,7 +19,9 @@ import pytest
 
 from cap4d import cli
 from cap4d.drive.arkit import NAMES
+from cap4d.drive.head_turn import head_pose, turn
 from cap4d.drive.impair import BadLine, Impairment
+from cap4d.drive.livelink import parse_livelink
 from cap4d.drive.livelink_format import format_livelink
 from cap4d.drive.packet import Packet
 from cap4d.drive.recording import Recording
@@ -299,6 +301,24 @@ def test_live_link_face_packets_are_written_byte_by_byte():
     assert data[30] == 61
     values = struct.unpack(">61f", data[31:])
     assert values == (*arkit.tolist(), *[0.0] * 9)
+
+
+def test_what_is_written_is_read_back_gaze_and_head_too():
+    rng = np.random.default_rng(0)
+    eyes = turn(0.3, -0.2)
+    packet = Packet(
+        1.25, arkit=rng.random(52).astype(np.float32), eye_rot=eyes, **head_pose(turn(0.5, 0.3, -0.2))
+    )
+    back = parse_livelink(format_livelink(packet))
+    assert back.t == 1.25
+    np.testing.assert_array_equal(back.arkit, packet.arkit)
+    for name in ("eye_rot", "rot", "tra", "neck_rot"):
+        np.testing.assert_allclose(getattr(back, name), getattr(packet, name), atol=1e-6)
+
+
+def test_a_head_with_a_place_in_a_world_has_no_angles_for_it():
+    packet = Packet(0.0, arkit=np.ones(52, np.float32), rot=np.float32([0, 3, 0]), tra=np.float32([0, 0, 1]))
+    assert parse_livelink(format_livelink(packet)).rot is None
 
 
 def test_lines_become_live_link_face_packets(monkeypatch):
