@@ -358,6 +358,9 @@ void load_pixel_grads(const TileJob& job, const Image& image, const ImageGrad& v
   }
 }
 
+// The pairs lie in the order of the caller's Gaussians, which is none here: their lines are fetched before they are written.
+constexpr std::size_t kPrefetchGrads = 8;
+
 template <bool kDepth>
 void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32_t* slots, SplatGrad* pair_grads) {
   FloatV transmittance[kBlocks];
@@ -365,6 +368,7 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
   Meetings meetings;
   for (std::size_t i = 0; i < job.count; ++i) {
     if (i % kChunk == 0 && open) meet_by_gaussian(job, i, static_cast<int>(std::min<std::size_t>(kChunk, job.count - i)), meetings);
+    if (i + kPrefetchGrads < job.count) __builtin_prefetch(&pair_grads[slots[i + kPrefetchGrads]], 1);
     const Splat& s = job.splats[job.isects[i]];
     BlockSet todo = open ? open & meetings.gaussians[i % kChunk] : 0;
     FloatV v_red{}, v_green{}, v_blue{}, v_depth{}, v_s{}, v_sx{}, v_su{}, v_sxx{}, v_sxu{}, v_suu{};
