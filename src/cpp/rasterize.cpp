@@ -321,38 +321,58 @@ struct PixelGrads {  // dL/d of what a pixel accumulates: per Gaussian it adds w
   FloatV x[kBlocks], y[kBlocks];  // its centre, px
 };
 
-// What the loss says of a block's pixels and what the forward pass made of them; zero outside the image and where nothing is given.
-struct PixelLanes {
-  float rgb[3][kLanes], alpha[kLanes], depth[kLanes], v_rgb[3][kLanes], v_alpha[kLanes], v_depth[kLanes];
+// kComponents floats a pixel, block by block; zero outside the image.
+template <int kComponents>
+using Blocks = float[kBlocks][kComponents * kLanes];
+
+template <int kComponents>
+void gather_pixels(const TileJob& job, const float* image, Blocks<kComponents>& blocks) {
+  const std::size_t width = job.camera->width;
+  if (!whole(job)) std::memset(blocks, 0, sizeof blocks);
+  for (int block = 0; block < kBlocks; ++block) {
+    const std::size_t corner = (job.y0 + block_y(block)) * width + job.x0 + block_x(block);
+    constexpr std::size_t kRow = kComponents * kBlockWidth;
+    if (whole(job))
+      for (int row = 0; row < kBlockHeight; ++row) std::memcpy(blocks[block] + row * kRow, image + kComponents * (corner + row * width), kRow * sizeof(float));
+    else
+      each_pixel(job, block, [&](std::size_t at, int l) { std::copy_n(image + kComponents * at, kComponents, blocks[block] + kComponents * l); });
+  }
+}
+
+struct TilePixels {  // what the forward pass made of a tile's pixels and what the loss says of them; alpha and depth where it says anything
+  Blocks<3> rgb, v_rgb;
+  Blocks<1> alpha, depth, v_alpha, v_depth;
 };
 
-CAP4D_INLINE void gather_pixels(const TileJob& job, const Image& image, const ImageGrad& v, int block, PixelLanes& lanes) {
-  lanes = {};
-  each_pixel(job, block, [&](std::size_t at, int l) {
-    for (int c = 0; c < 3; ++c) lanes.rgb[c][l] = image.rgb[3 * at + c], lanes.v_rgb[c][l] = v.rgb[3 * at + c];
-    lanes.alpha[l] = image.alpha[at];
-    if (v.alpha) lanes.v_alpha[l] = v.alpha[at];
-    if (v.depth) lanes.depth[l] = image.depth[at], lanes.v_depth[l] = v.depth[at];
-  });
+void load_pixels(const TileJob& job, const Image& image, const ImageGrad& v, TilePixels& pixels) {
+  gather_pixels<3>(job, image.rgb, pixels.rgb), gather_pixels<3>(job, v.rgb, pixels.v_rgb);
+  gather_pixels<1>(job, image.alpha, pixels.alpha);
+  if (v.alpha) gather_pixels<1>(job, v.alpha, pixels.v_alpha);
+  if (v.depth) gather_pixels<1>(job, image.depth, pixels.depth), gather_pixels<1>(job, v.depth, pixels.v_depth);
 }
 
 void load_pixel_grads(const TileJob& job, const Image& image, const ImageGrad& v, PixelGrads& grads) {
+  TilePixels pixels;
+  load_pixels(job, image, v, pixels);
   for (int block = 0; block < kBlocks; ++block) {
-    PixelLanes lanes;
-    gather_pixels(job, image, v, block, lanes);
-    const FloatV alpha = load(lanes.alpha), image_depth = load(lanes.depth);
-    // depth = accumulated / alpha
-    const FloatV depth = keep(less(splat(0.0f), alpha), load(lanes.v_depth) / alpha);
-    FloatV constant = load(lanes.v_alpha) - depth * image_depth, foreground = FloatV{}, v_rgb[3];
+    FloatV rgb[3], v_rgb[3], constant{}, foreground{}, v_depth{};
+    deinterleave<3>(pixels.rgb[block], rgb), deinterleave<3>(pixels.v_rgb[block], v_rgb);
+    const FloatV alpha = load(pixels.alpha[block]);
+    if (v.alpha) constant = load(pixels.v_alpha[block]);
+    if (v.depth) {  // depth = accumulated / alpha
+      const FloatV depth = load(pixels.depth[block]);
+      v_depth = keep(less(splat(0.0f), alpha), load(pixels.v_depth[block]) / alpha);
+      constant -= v_depth * depth;
+      foreground = v_depth * depth * alpha;
+    }
     for (int c = 0; c < 3; ++c) {  // rgb = accumulated + (1 - alpha) background
       const float background = job.background[c];
-      v_rgb[c] = load(lanes.v_rgb[c]);
       constant -= v_rgb[c] * background;
-      foreground += v_rgb[c] * (load(lanes.rgb[c]) - background + background * alpha);
+      foreground += v_rgb[c] * (rgb[c] - background + background * alpha);
     }
-    foreground += constant * alpha + depth * image_depth * alpha;
+    foreground += constant * alpha;
     grads.red[block] = v_rgb[0], grads.green[block] = v_rgb[1], grads.blue[block] = v_rgb[2];
-    grads.depth[block] = depth, grads.constant[block] = constant, grads.behind[block] = foreground;
+    grads.depth[block] = v_depth, grads.constant[block] = constant, grads.behind[block] = foreground;
     grads.x[block] = load(kPixel.x) + static_cast<float>(job.x0 + block_x(block));
     grads.y[block] = load(kPixel.y) + static_cast<float>(job.y0 + block_y(block));
   }

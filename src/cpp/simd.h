@@ -241,6 +241,60 @@ CAP4D_INLINE void load_rows8(const float* const* rows, FloatV* columns) {
 #endif
 }
 
+#ifdef CAP4D_AVX512
+template <int kComponents>
+struct Interleaving {  // at[c][n]: where the lanes of row c come from when source n joins what was taken from those before it
+  std::int32_t columns[kComponents][kComponents][kLanes], items[kComponents][kComponents][kLanes];
+};
+template <int kComponents>
+constexpr Interleaving<kComponents> kInterleaving = [] {
+  Interleaving<kComponents> at{};
+  for (int c = 0; c < kComponents; ++c)
+    for (int n = 1; n < kComponents; ++n)
+      for (int l = 0; l < kLanes; ++l) {
+        const int item = kComponents * l + c, flat = kLanes * c + l;  // where lane l of column c lies; what lane l of row c is
+        const auto from = [&](int source, int lane) { return source == n ? kLanes + lane : n == 1 ? lane : l; };
+        at.columns[c][n][l] = from(item / kLanes, item % kLanes);
+        at.items[c][n][l] = from(flat % kComponents, flat / kComponents);
+      }
+  return at;
+}();
+template <int kComponents>
+CAP4D_INLINE FloatV merge(const FloatV* sources, const std::int32_t (*at)[kLanes]) {
+  FloatV merged = sources[0];
+  for (int n = 1; n < kComponents; ++n) merged = _mm512_permutex2var_ps(merged, _mm512_loadu_si512(at[n]), sources[n]);
+  return merged;
+}
+#endif
+
+// Component c of each of kLanes items that lie one after the other: an array of structures as registers.
+template <int kComponents>
+CAP4D_INLINE void deinterleave(const float* items, FloatV* columns) {
+#ifdef CAP4D_AVX512
+  FloatV rows[kComponents];
+  for (int n = 0; n < kComponents; ++n) rows[n] = load(items + kLanes * n);
+  for (int c = 0; c < kComponents; ++c) columns[c] = merge<kComponents>(rows, kInterleaving<kComponents>.columns[c]);
+#else
+  float lanes[kComponents][kLanes];
+  for (int l = 0; l < kLanes; ++l)
+    for (int c = 0; c < kComponents; ++c) lanes[c][l] = items[kComponents * l + c];
+  for (int c = 0; c < kComponents; ++c) columns[c] = load(lanes[c]);
+#endif
+}
+
+// The way back.
+template <int kComponents>
+CAP4D_INLINE void interleave(const FloatV* columns, float* items) {
+#ifdef CAP4D_AVX512
+  for (int n = 0; n < kComponents; ++n) store(items + kLanes * n, merge<kComponents>(columns, kInterleaving<kComponents>.items[n]));
+#else
+  float lanes[kComponents][kLanes];
+  for (int c = 0; c < kComponents; ++c) store(lanes[c], columns[c]);
+  for (int l = 0; l < kLanes; ++l)
+    for (int c = 0; c < kComponents; ++c) items[kComponents * l + c] = lanes[c][l];
+#endif
+}
+
 // About 1 / x for normal x, relative error below 3e-7.
 CAP4D_INLINE FloatV reciprocal(FloatV x) {
 #ifdef CAP4D_AVX512
