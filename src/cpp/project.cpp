@@ -11,9 +11,9 @@
 namespace cap4d::CAP4D_ISA {
 
 extern const Kernels kKernels;
-void rasterize_fwd(const TileJob&, const Image&);
+void rasterize_fwd(const TileJob&, const Image&, BlockSet*);
 void rasterize_rgba8(const TileJob&, const Image8&);
-void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t*, SplatGrad*);
+void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const BlockSet*, const std::uint32_t*, SplatGrad*);
 
 namespace {
 
