@@ -20,12 +20,11 @@ namespace {
 // Lane l of component c of items first, first + 1, ...: an array of structures as registers. Lanes past `count` repeat the last item.
 template <int kComponents>
 CAP4D_INLINE void gather(const float* items, std::size_t first, int count, FloatV* out) {
-  float lanes[kComponents][kLanes];
-  for (int l = 0; l < kLanes; ++l) {
-    const float* item = items + kComponents * (first + (l < count ? l : count - 1));
-    for (int c = 0; c < kComponents; ++c) lanes[c][l] = item[c];
-  }
-  for (int c = 0; c < kComponents; ++c) out[c] = load(lanes[c]);
+  const float* from = items + kComponents * first;
+  if (count == kLanes) return deinterleave<kComponents>(from, out);
+  float some[kComponents * kLanes];
+  for (int l = 0; l < kLanes; ++l) std::copy_n(from + kComponents * std::min(l, count - 1), kComponents, some + kComponents * l);
+  deinterleave<kComponents>(some, out);
 }
 
 CAP4D_INLINE Shape3<FloatV> gather_shape(const GaussiansView& g, std::size_t first, int count) {
@@ -354,10 +353,13 @@ CAP4D_INLINE void sh_color_vjp(const FloatV* sh, int used, const FloatV* basis, 
 // Rows of kComponents floats from registers, those of `drawn`, and zeros for the others: their lanes may hold anything.
 template <int kComponents>
 CAP4D_INLINE void scatter(const FloatV* values, MaskV drawn, std::size_t first, int count, float* items) {
-  float lanes[kComponents][kLanes];
-  for (int c = 0; c < kComponents; ++c) store(lanes[c], keep(drawn, values[c]));
-  for (int l = 0; l < count; ++l)
-    for (int c = 0; c < kComponents; ++c) items[kComponents * (first + l) + c] = lanes[c][l];
+  FloatV kept[kComponents];
+  for (int c = 0; c < kComponents; ++c) kept[c] = keep(drawn, values[c]);
+  float* to = items + kComponents * first;
+  if (count == kLanes) return interleave<kComponents>(kept, to);
+  float some[kComponents * kLanes];
+  interleave<kComponents>(kept, some);
+  std::copy_n(some, kComponents * count, to);
 }
 
 void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin, std::size_t end, const std::int32_t* radii,
