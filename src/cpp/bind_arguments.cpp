@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <new>
 #include <stdexcept>
 #include <string>
 
@@ -48,6 +49,15 @@ Inputs make_inputs(FloatArray means, FloatArray quats, FloatArray scales, FloatA
   const GaussiansView view{static_cast<std::size_t>(n), stored, sh_degree < 0 ? degree : sh_degree,
                            means.data(), quats.data(), scales.data(), opacities.data(), sh.data()};
   return {means, quats, scales, opacities, sh, view};
+}
+
+FloatArray aligned_array(std::vector<py::ssize_t> shape) {
+  constexpr std::align_val_t kLine{64};
+  std::size_t size = sizeof(float);
+  for (const py::ssize_t n : shape) size *= static_cast<std::size_t>(n);
+  auto* data = static_cast<float*>(::operator new(size, kLine));
+  const py::capsule owner(data, [](void* p) { ::operator delete(p, kLine); });
+  return FloatArray(std::move(shape), data, owner);
 }
 
 Camera checked_camera(const DoubleArray& viewmat, const DoubleArray& K, int width, int height) {

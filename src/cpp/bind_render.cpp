@@ -62,7 +62,7 @@ py::tuple rasterize_vjp(const Rendered& rendered, FloatArray means, FloatArray q
   if (v_alpha) expect(*v_alpha, "v_alpha", {height, width});
   if (v_depth) expect(*v_depth, "v_depth", {height, width});
   FloatArray v_means({n, py::ssize_t{3}}), v_quats({n, py::ssize_t{4}}), v_scales({n, py::ssize_t{3}}), v_opacities(n);
-  FloatArray v_sh({n, sh.shape(1), py::ssize_t{3}}), v_means2d({n, py::ssize_t{2}});
+  FloatArray v_sh = aligned_array({n, sh.shape(1), 3}), v_means2d({n, py::ssize_t{2}});
   const Image image{const_cast<float*>(rgb.data()), const_cast<float*>(alpha.data()), const_cast<float*>(depth.data())};
   const ImageGrad v_image{v_rgb.data(), v_alpha ? v_alpha->data() : nullptr, v_depth ? v_depth->data() : nullptr};
   const GaussianGrads grads{v_means.mutable_data(), v_quats.mutable_data(), v_scales.mutable_data(),

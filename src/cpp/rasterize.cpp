@@ -421,7 +421,8 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const BlockSet* m
       pair_grads[slots[i]] = SplatGrad{};
       continue;
     }
-    store4(out, sums4(fold4(v_red), fold4(v_green), fold4(v_blue), fold4(v_depth)));
+    const Float4 color = load4(&s.red);  // clamped at 0: the coefficients of a channel that is 0 move nothing; depth is positive
+    store4(out, positive_only(color, sums4(fold4(v_red), fold4(v_green), fold4(v_blue), fold4(v_depth))));
     store4(out + 4, sums4(fold4(v_s), fold4(v_sx), fold4(v_su), fold4(v_sxx)));
     store4(out + 8, sums4(fold4(v_sxu), fold4(v_suu), Float4{}, Float4{}));
   }
