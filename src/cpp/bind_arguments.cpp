@@ -2,11 +2,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <new>
 #include <stdexcept>
 #include <string>
 
 #include "constants.h"
+#include "pages.h"
 
 namespace py = pybind11;
 
@@ -52,11 +52,10 @@ Inputs make_inputs(FloatArray means, FloatArray quats, FloatArray scales, FloatA
 }
 
 FloatArray aligned_array(std::vector<py::ssize_t> shape) {
-  constexpr std::align_val_t kLine{64};
   std::size_t size = sizeof(float);
   for (const py::ssize_t n : shape) size *= static_cast<std::size_t>(n);
-  auto* data = static_cast<float*>(::operator new(size, kLine));
-  const py::capsule owner(data, [](void* p) { ::operator delete(p, kLine); });
+  auto* data = static_cast<float*>(allocate_pages(size));
+  const py::capsule owner(data, &release_pages);
   return FloatArray(std::move(shape), data, owner);
 }
 

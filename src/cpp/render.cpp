@@ -183,7 +183,7 @@ void Splatter::draw(const View& view, int threads, const Image8& image) {
 
 void render_bwd(const Rendered& r, const GaussiansView& gaussians, const Image& image, const ImageGrad& v_image, int threads,
                 const GaussianGrads& grads) {
-  auto pair_grads = make_buffer<SplatGrad>(r.pairs);
+  auto pair_grads = make_pages<SplatGrad>(r.pairs);
   parallel_for(grid_of(r.camera).count(), 1, threads, [&](std::size_t begin, std::size_t end) {
     for (std::size_t tile = begin; tile < end; ++tile) {
       const std::uint32_t first = r.lists.offsets[tile];
