@@ -305,12 +305,13 @@ CAP4D_INLINE void gather_received(const PairGrads& pairs, std::size_t first, std
   load_rows8(high, received + 8);
 }
 
-// Asks for the coefficients that are read a few turns after `first`: more than the processor foresees by itself.
+// Asks for the coefficients that are read a few turns after `first`: more than the processor foresees by itself. Into the second-level
+// cache: the first has too few misses in flight for all of a turn's lines.
 CAP4D_INLINE void prefetch_sh(const GaussiansView& g, std::size_t first, std::size_t end) {
   constexpr std::size_t kAhead = 4 * kLanes, kLine = 16;
   if (first + kAhead + kLanes > end) return;
   const float* from = g.sh + 3 * g.sh_count * (first + kAhead);
-  for (std::size_t i = 0; i < 3 * static_cast<std::size_t>(g.sh_count) * kLanes; i += kLine) __builtin_prefetch(from + i);
+  for (std::size_t i = 0; i < 3 * static_cast<std::size_t>(g.sh_count) * kLanes; i += kLine) __builtin_prefetch(from + i, 0, 2);
 }
 
 // v_basis [kShMax] of kLanes Gaussians' coefficients; rubbish beyond `used`. Lanes past `count` repeat the last.
