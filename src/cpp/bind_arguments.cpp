@@ -6,6 +6,7 @@
 #include <string>
 
 #include "constants.h"
+#include "pages.h"
 
 namespace py = pybind11;
 
@@ -48,6 +49,14 @@ Inputs make_inputs(FloatArray means, FloatArray quats, FloatArray scales, FloatA
   const GaussiansView view{static_cast<std::size_t>(n), stored, sh_degree < 0 ? degree : sh_degree,
                            means.data(), quats.data(), scales.data(), opacities.data(), sh.data()};
   return {means, quats, scales, opacities, sh, view};
+}
+
+FloatArray aligned_array(std::vector<py::ssize_t> shape) {
+  std::size_t size = sizeof(float);
+  for (const py::ssize_t n : shape) size *= static_cast<std::size_t>(n);
+  auto* data = static_cast<float*>(allocate_pages(size));
+  const py::capsule owner(data, &release_pages);
+  return FloatArray(std::move(shape), data, owner);
 }
 
 Camera checked_camera(const DoubleArray& viewmat, const DoubleArray& K, int width, int height) {

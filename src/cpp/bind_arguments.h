@@ -5,6 +5,7 @@
 
 #include <array>
 #include <optional>
+#include <vector>
 
 #include "camera.h"
 #include "gaussians.h"
@@ -27,6 +28,9 @@ struct Inputs {  // the view's arrays are these
   GaussiansView view;
 };
 Inputs make_inputs(FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh, int sh_degree);
+
+// An array that begins with a cache line; not initialised.
+FloatArray aligned_array(std::vector<pybind11::ssize_t> shape);
 
 struct OwnedImage {
   FloatArray rgb, alpha, depth;

@@ -11,6 +11,8 @@ namespace py = pybind11;
 namespace cap4d {
 namespace {
 
+constexpr std::size_t kGrain = 8192;  // Gaussians per piece of work
+
 py::tuple render(FloatArray means, FloatArray quats, FloatArray scales, FloatArray opacities, FloatArray sh, DoubleArray viewmat, DoubleArray K,
                  int width, int height, Background background, int sh_degree, int threads) {
   const Inputs in = make_inputs(means, quats, scales, opacities, sh, sh_degree);
@@ -40,11 +42,13 @@ py::tuple rasterize(FloatArray means, FloatArray quats, FloatArray scales, Float
   {
     py::gil_scoped_release release;
     render_fwd(camera, in.view, background ? background->data() : nullptr, Pass::kTrain, threads, out, *rendered);
-    std::copy_n(rendered->radii.get(), n, radius);
-    for (py::ssize_t i = 0; i < n; ++i) {
-      const bool drawn = radius[i] > 0;
-      xy[2 * i] = drawn ? rendered->splats[i].x : 0.0f, xy[2 * i + 1] = drawn ? rendered->splats[i].y : 0.0f;
-    }
+    parallel_for(n, kGrain, threads, [&](std::size_t begin, std::size_t end) {
+      for (std::size_t i = begin; i < end; ++i) {
+        const bool drawn = rendered->radii[i] > 0;
+        radius[i] = rendered->radii[i];
+        xy[2 * i] = drawn ? rendered->splats[i].x : 0.0f, xy[2 * i + 1] = drawn ? rendered->splats[i].y : 0.0f;
+      }
+    });
   }
   return py::make_tuple(image.rgb, image.alpha, image.depth, means2d, radii, py::cast(std::move(rendered)));
 }
@@ -62,7 +66,7 @@ py::tuple rasterize_vjp(const Rendered& rendered, FloatArray means, FloatArray q
   if (v_alpha) expect(*v_alpha, "v_alpha", {height, width});
   if (v_depth) expect(*v_depth, "v_depth", {height, width});
   FloatArray v_means({n, py::ssize_t{3}}), v_quats({n, py::ssize_t{4}}), v_scales({n, py::ssize_t{3}}), v_opacities(n);
-  FloatArray v_sh({n, sh.shape(1), py::ssize_t{3}}), v_means2d({n, py::ssize_t{2}});
+  FloatArray v_sh = aligned_array({n, sh.shape(1), 3}), v_means2d({n, py::ssize_t{2}});
   const Image image{const_cast<float*>(rgb.data()), const_cast<float*>(alpha.data()), const_cast<float*>(depth.data())};
   const ImageGrad v_image{v_rgb.data(), v_alpha ? v_alpha->data() : nullptr, v_depth ? v_depth->data() : nullptr};
   const GaussianGrads grads{v_means.mutable_data(), v_quats.mutable_data(), v_scales.mutable_data(),

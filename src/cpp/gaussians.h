@@ -51,7 +51,7 @@ struct PairRun {
   std::uint32_t first, count, listed;
 };
 
-// Sums over the pixels of one tile (or of the image) of what one Gaussian receives.
+// Sums over the pixels of one tile (or of the image) of what one Gaussian receives; of the colours where they are not clamped.
 // s = dL/d(ln alpha) at a pixel; its moments about the mean in dx and u = dy - shear dx give the gradients of position, covariance
 // and opacity.
 struct SplatGrad {

@@ -36,6 +36,9 @@ struct TileJob {
   const float* background;  // [3]
 };
 
+// Bit i: something of a tile's block i; which pixels a block has is the instruction set's own matter.
+typedef std::uint64_t BlockSet;
+
 // What Gaussian i received in each of its tiles: grads[runs[i].first], runs[i].count of them.
 struct PairGrads {
   const SplatGrad* grads;
@@ -55,12 +58,13 @@ struct Kernels {
   void (*triangle_frames)(const float* vertices, const std::int32_t* faces, std::size_t begin, std::size_t end, TriangleFrame* frames);
   void (*project_bwd)(const Camera&, const GaussiansView&, std::size_t begin, std::size_t end, const std::int32_t* radii, const PairGrads&,
                       const GaussianGrads&);
-  void (*rasterize_fwd)(const TileJob&, const Image&);
+  // met [job.count]: the blocks that each Gaussian meets, none where all pixels are finished, for rasterize_bwd; or null.
+  void (*rasterize_fwd)(const TileJob&, const Image&, BlockSet* met);
   void (*rasterize_rgba8)(const TileJob&, const Image8&);
   // How many Gaussians each pixel takes, hidden ones too: counts [H, W].
   void (*count_gaussians)(const TileJob&, std::uint16_t* counts);
   // Writes grads[slots[i]] for each i of the job.
-  void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t* slots, SplatGrad* grads);
+  void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, const BlockSet* met, const std::uint32_t* slots, SplatGrad* grads);
 };
 
 // The widest variant this processor runs; CAP4D_ISA=base|v3|v4|vnni in the environment asks for a narrower one.

@@ -11,22 +11,21 @@
 namespace cap4d::CAP4D_ISA {
 
 extern const Kernels kKernels;
-void rasterize_fwd(const TileJob&, const Image&);
+void rasterize_fwd(const TileJob&, const Image&, BlockSet*);
 void rasterize_rgba8(const TileJob&, const Image8&);
 void count_gaussians(const TileJob&, std::uint16_t*);
-void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t*, SplatGrad*);
+void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const BlockSet*, const std::uint32_t*, SplatGrad*);
 
 namespace {
 
 // Lane l of component c of items first, first + 1, ...: an array of structures as registers. Lanes past `count` repeat the last item.
 template <int kComponents>
 CAP4D_INLINE void gather(const float* items, std::size_t first, int count, FloatV* out) {
-  float lanes[kComponents][kLanes];
-  for (int l = 0; l < kLanes; ++l) {
-    const float* item = items + kComponents * (first + (l < count ? l : count - 1));
-    for (int c = 0; c < kComponents; ++c) lanes[c][l] = item[c];
-  }
-  for (int c = 0; c < kComponents; ++c) out[c] = load(lanes[c]);
+  const float* from = items + kComponents * first;
+  if (count == kLanes) return deinterleave<kComponents>(from, out);
+  float some[kComponents * kLanes];
+  for (int l = 0; l < kLanes; ++l) std::copy_n(from + kComponents * std::min(l, count - 1), kComponents, some + kComponents * l);
+  deinterleave<kComponents>(some, out);
 }
 
 CAP4D_INLINE Shape3<FloatV> gather_shape(const GaussiansView& g, std::size_t first, int count) {
@@ -52,35 +51,6 @@ CAP4D_INLINE Direction view_direction(const Camera& camera, const FloatV* mean) 
 
 constexpr int kShFloats = 3 * kShMax;  // of one Gaussian with all harmonics: a whole number of 8s, and of 16s
 
-// The first 3 `used` floats of kLanes Gaussians' coefficients; those of the last repeat past `count`. `sh` [kShFloats] holds rubbish
-// beyond. Memory is read in order, one Gaussian after the other: 16 rows side by side would be too many streams to foresee.
-CAP4D_INLINE void gather_sh(const GaussiansView& g, int used, std::size_t first, int count, FloatV* sh) {
-  const std::size_t stored = 3 * static_cast<std::size_t>(g.sh_count), wanted = (3 * static_cast<std::size_t>(used) + 7) / 8 * 8;
-  alignas(64) float near[kLanes][kShFloats];
-  const float* rows[kLanes];
-  for (int l = 0; l < kLanes; ++l) {
-    const float* from = g.sh + stored * (first + (l < count ? l : count - 1));
-    rows[l] = near[l];
-    if (stored == kShFloats) std::memcpy(near[l], from, kShFloats * sizeof(float));
-    else std::memcpy(near[l], from, stored * sizeof(float));
-  }
-  for (std::size_t i = 0; i < wanted; i += 8) {
-    load_rows8(rows, sh + i);
-    for (const float*& row : rows) row += 8;
-  }
-}
-
-// Writes `v_sh` [kShFloats], zero beyond what is used, as rows of `out`; in order, as above.
-CAP4D_INLINE void scatter_sh(const FloatV* v_sh, const GaussiansView& g, std::size_t first, int count, float* out) {
-  const std::size_t stored = 3 * static_cast<std::size_t>(g.sh_count);
-  alignas(64) float near[kLanes][kShFloats];
-  for (int i = 0; i < kShFloats; i += 16) store_rows16(v_sh + i, &near[0][i], kShFloats, (1u << count) - 1);
-  for (int l = 0; l < count; ++l) {
-    if (stored == kShFloats) std::memcpy(out + stored * (first + l), near[l], kShFloats * sizeof(float));
-    else std::memcpy(out + stored * (first + l), near[l], stored * sizeof(float));
-  }
-}
-
 // The colour of one Gaussian, the `lane`th of `basis` [k][lane]: 0.5 + sum of basis x coefficients, before the clamp at 0. The fourth
 // element is rubbish. Forward this beats turning the coefficients into registers: nothing else needs them.
 CAP4D_INLINE Float4 sh_color_at(const float* sh, int count, const float basis[][kLanes], int lane) {
@@ -93,13 +63,6 @@ CAP4D_INLINE Float4 sh_color_at(const float* sh, int count, const float basis[][
   }
   for (; k < last; ++k) even += basis[k][lane] * load4(sh + 3 * k);
   return even + odd + basis[last][lane] * Float4{sh[3 * last], sh[3 * last + 1], sh[3 * last + 2], 0.0f};
-}
-
-// The same of kLanes Gaussians.
-CAP4D_INLINE void sh_color(const FloatV* sh, int used, const FloatV* basis, FloatV* color) {
-  for (int c = 0; c < 3; ++c) color[c] = splat(0.5f);
-  for (int k = 0; k < used; ++k)
-    for (int c = 0; c < 3; ++c) color[c] += basis[k] * sh[3 * k + c];
 }
 
 // Three standard deviations along the longest axis, px, rounded up.
@@ -343,22 +306,67 @@ CAP4D_INLINE void gather_received(const PairGrads& pairs, std::size_t first, std
   load_rows8(high, received + 8);
 }
 
-// v_sh [kShFloats] and v_basis [kShMax] from v_color, which is already masked by the clamp.
-CAP4D_INLINE void sh_color_vjp(const FloatV* sh, int used, const FloatV* basis, const FloatV* v_color, FloatV* v_sh, FloatV* v_basis) {
-  for (int k = 0; k < used; ++k) {
-    for (int c = 0; c < 3; ++c) v_sh[3 * k + c] = basis[k] * v_color[c];
-    v_basis[k] = v_color[0] * sh[3 * k] + v_color[1] * sh[3 * k + 1] + v_color[2] * sh[3 * k + 2];
+// Asks for the coefficients that are read a few turns after `first`: more than the processor foresees by itself. Into the second-level
+// cache: the first has too few misses in flight for all of a turn's lines.
+CAP4D_INLINE void prefetch_sh(const GaussiansView& g, std::size_t first, std::size_t end) {
+  constexpr std::size_t kAhead = 4 * kLanes, kLine = 16;
+  if (first + kAhead + kLanes > end) return;
+  const float* from = g.sh + 3 * g.sh_count * (first + kAhead);
+  for (std::size_t i = 0; i < 3 * static_cast<std::size_t>(g.sh_count) * kLanes; i += kLine) __builtin_prefetch(from + i, 0, 2);
+}
+
+// v_basis [kShMax] of kLanes Gaussians' coefficients; rubbish beyond `used`. Lanes past `count` repeat the last.
+CAP4D_INLINE void sh_basis_grad(const GaussiansView& g, int used, std::size_t first, int count, const FloatV* v_color, FloatV* v_basis) {
+  constexpr int kSome = 8;  // coefficients at once: what registers hold
+  const std::size_t stored = 3 * static_cast<std::size_t>(g.sh_count);
+  alignas(64) float whole[kLanes][kShFloats];
+  const float* rows[kLanes];
+  for (int l = 0; l < kLanes; ++l) {
+    const float* from = g.sh + stored * (first + (l < count ? l : count - 1));
+    rows[l] = stored == kShFloats ? from : whole[l];
+    if (stored != kShFloats) std::memcpy(whole[l], from, stored * sizeof(float));
   }
-  for (int i = 3 * used; i < kShFloats; ++i) v_sh[i] = FloatV{};
+  for (int k = 0; k < used; k += kSome) {
+    FloatV sh[3 * kSome];
+    for (int i = 0; i < 3 * kSome; i += 8) {
+      load_rows8(rows, sh + i);
+      for (const float*& row : rows) row += 8;
+    }
+    for (int j = 0; j < kSome; ++j) v_basis[k + j] = v_color[0] * sh[3 * j] + v_color[1] * sh[3 * j + 1] + v_color[2] * sh[3 * j + 2];
+  }
+}
+
+// Whether every register of a row of all coefficients may be streamed to.
+CAP4D_INLINE bool streams(const float* sh, std::size_t stored) {
+  return stored == kShFloats && reinterpret_cast<std::uintptr_t>(sh) % sizeof(FloatV) == 0;
+}
+
+// Writes the gradient of kLanes Gaussians' coefficients, basis x v_color, zero beyond `used`, as rows of `out`.
+CAP4D_INLINE void put_sh_grad(const GaussiansView& g, int used, std::size_t first, int count, const FloatV* basis, const FloatV* v_color, float* out) {
+  const std::size_t stored = 3 * static_cast<std::size_t>(g.sh_count);
+  const std::uint32_t real = (1u << count) - 1;
+  float* to = out + stored * first;
+  alignas(64) float whole[kLanes][kShFloats];
+  for (int begin = 0; begin < static_cast<int>(stored); begin += 16) {
+    FloatV v_sh[16];
+    for (int i = begin; i < begin + 16; ++i) v_sh[i - begin] = i < 3 * used ? basis[i / 3] * v_color[i % 3] : FloatV{};
+    if (streams(out, stored)) store_rows16<stream>(v_sh, to + begin, kShFloats, real);
+    else store_rows16(v_sh, &whole[0][begin], kShFloats, real);
+  }
+  if (streams(out, stored)) return;
+  for (int l = 0; l < count; ++l) std::memcpy(to + stored * l, whole[l], stored * sizeof(float));
 }
 
 // Rows of kComponents floats from registers, those of `drawn`, and zeros for the others: their lanes may hold anything.
 template <int kComponents>
 CAP4D_INLINE void scatter(const FloatV* values, MaskV drawn, std::size_t first, int count, float* items) {
-  float lanes[kComponents][kLanes];
-  for (int c = 0; c < kComponents; ++c) store(lanes[c], keep(drawn, values[c]));
-  for (int l = 0; l < count; ++l)
-    for (int c = 0; c < kComponents; ++c) items[kComponents * (first + l) + c] = lanes[c][l];
+  FloatV kept[kComponents];
+  for (int c = 0; c < kComponents; ++c) kept[c] = keep(drawn, values[c]);
+  float* to = items + kComponents * first;
+  if (count == kLanes) return interleave<kComponents>(kept, to);
+  float some[kComponents * kLanes];
+  interleave<kComponents>(kept, some);
+  std::copy_n(some, kComponents * count, to);
 }
 
 void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin, std::size_t end, const std::int32_t* radii,
@@ -366,6 +374,7 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
   const int used = (g.sh_degree + 1) * (g.sh_degree + 1);
   for (std::size_t first = begin; first < end; first += kLanes) {
     const int count = static_cast<int>(std::min<std::size_t>(kLanes, end - first));
+    prefetch_sh(g, first, end);
     std::uint32_t which = 0;
     for (int l = 0; l < count; ++l) which |= static_cast<std::uint32_t>(radii[first + l] > 0) << l;
     const MaskV drawn = mask_of(which);
@@ -385,14 +394,12 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     Shape3<FloatV> v_shape = project_vjp(camera, shape, p, v);
 
     const Direction direction = view_direction(camera, shape.mean);
-    FloatV basis[kShMax], sh[kShFloats], color[3], v_color[3], v_basis[kShMax], v_sh[kShFloats], v_unit[3];
+    FloatV basis[kShMax], v_basis[kShMax], v_unit[3];
+    const FloatV* v_color = received;
     sh_basis(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], basis);
-    gather_sh(g, used, first, count, sh);
-    sh_color(sh, used, basis, color);
-    for (int c = 0; c < 3; ++c) v_color[c] = keep(both(drawn, less(splat(0.0f), color[c])), received[c]);
-    sh_color_vjp(sh, used, basis, v_color, v_sh, v_basis);
-    for (int i = 0; i < 3 * used; ++i) v_sh[i] = keep(drawn, v_sh[i]);
-    scatter_sh(v_sh, g, first, count, out.sh);
+    for (int k = 0; k < used; ++k) basis[k] = keep(drawn, basis[k]);  // what is not drawn may lie anywhere
+    sh_basis_grad(g, used, first, count, v_color, v_basis);
+    put_sh_grad(g, used, first, count, basis, v_color, out.sh);
     sh_basis_vjp(g.sh_degree, direction.unit[0], direction.unit[1], direction.unit[2], v_basis, v_unit);
     // Where a basis function is 0, its coefficient may be anything that is a number and the colour still sane.
     const MaskV fits = less(absolute(v_unit[0]) + absolute(v_unit[1]) + absolute(v_unit[2]), splat(1e30f));  // false for NaN
@@ -408,6 +415,7 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
     scatter<2>(v_means2d, drawn, first, count, out.means2d);
     scatter<1>(&v_opacity, drawn, first, count, out.opacities);
   }
+  end_stream();
 }
 
 #define CAP4D_NAME2(x) #x

@@ -3,7 +3,7 @@
 // A tile is cut into blocks of 4 columns by kLanes / 4 rows, one register each. Its list is taken in chunks that fit the first-level
 // cache: first the outlines of a chunk are met with the blocks, kLanes Gaussians at a time; then the blocks are drawn. Forward, each
 // block walks its own Gaussians with its pixels in registers and leaves when they are finished. Backward, each Gaussian walks its
-// blocks with its sums in registers.
+// blocks, which the forward pass noted, with its sums in registers.
 // Both passes go near to far. The gradient needs, for each Gaussian at each pixel, what lies behind it: that is the pixel's
 // total less what has been passed, so nothing per pixel has to be kept from the forward pass but its image.
 #include <algorithm>
@@ -21,9 +21,6 @@ namespace {
 constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlockColumns = kTile / kBlockWidth, kBands = kTile / kBlockHeight, kBlocks = kBlockColumns * kBands;
 static_assert(kBlocks <= 64);
-
-// Bit i: block i is not finished, or is touched.
-typedef std::uint64_t BlockSet;
 
 struct Lanes {  // pixel centres of a block, relative to its corner
   float x[kLanes], y[kLanes];
@@ -64,12 +61,9 @@ BlockSet open_pixels(const TileJob& job, FloatV* transmittance) {
   return open;
 }
 
-// Which of a chunk's Gaussians meet which blocks: `blocks[b]` has a bit per Gaussian, `gaussians[i]` a bit per block.
+// Which of a chunk's Gaussians meet a block: a bit for each.
 constexpr int kChunk = 256, kWords = kChunk / 64;
-struct Meetings {
-  std::uint64_t blocks[kBlocks][kWords];
-  BlockSet gaussians[kChunk];
-};
+typedef std::uint64_t GaussianSet[kWords];
 
 struct Outlines {  // of kLanes Gaussians; in the order of Splat
   FloatV x, y, half_height, slope, y_rightmost, half_width2, inv_height2;
@@ -114,30 +108,29 @@ CAP4D_INLINE void meet_blocks(const Outlines& s, int x0, int y0, const Note& not
   }
 }
 
-// Meets Gaussians [begin, begin + count) of the tile with its blocks; fills in `blocks`.
-void meet_by_block(const TileJob& job, std::size_t begin, int count, Meetings& meetings) {
-  std::memset(meetings.blocks, 0, sizeof meetings.blocks);
+// A lane's blocks as its bits, up to 32 in each word; and all of them as sets.
+constexpr int kBlockWords = (kBlocks + 31) / 32;
+CAP4D_INLINE void put_sets(const IntV* words, int count, BlockSet* sets) {
+  typedef std::uint32_t Word __attribute__((vector_size(4 * kLanes)));
+  typedef BlockSet Set __attribute__((vector_size(8 * kLanes)));
+  Set set{};
+  for (int w = 0; w < kBlockWords; ++w) set |= __builtin_convertvector(reinterpret_cast<Word>(words[w]), Set) << 32 * w;
+  std::memcpy(sets, &set, count == kLanes ? sizeof set : count * sizeof *sets);
+}
+
+// Meets Gaussians [begin, begin + count) of the tile with its blocks. kKeep: and fills in met [count].
+template <bool kKeep>
+void meet(const TileJob& job, std::size_t begin, int count, GaussianSet* of_block, BlockSet* met_by) {
+  std::memset(of_block, 0, kBlocks * sizeof *of_block);
   for (int first = 0; first < count; first += kLanes) {
     const int some = std::min(kLanes, count - first);
     const std::uint32_t real = (1u << some) - 1;
-    meet_blocks(gather_outlines(job, begin + first, some), job.x0, job.y0,
-                [&](int block, MaskV met) { meetings.blocks[block][first / 64] |= std::uint64_t{bits(met) & real} << first % 64; });
-  }
-}
-
-// The same; fills in `gaussians`.
-void meet_by_gaussian(const TileJob& job, std::size_t begin, int count, Meetings& meetings) {
-  constexpr int kWordsOf32 = (kBlocks + 31) / 32;
-  for (int first = 0; first < count; first += kLanes) {
-    IntV touched[kWordsOf32] = {};
-    meet_blocks(gather_outlines(job, begin + first, std::min(kLanes, count - first)), job.x0, job.y0, [&](int block, MaskV met) {
-      touched[block / 32] |= keep_int(met, static_cast<std::int32_t>(1u << block % 32));
+    IntV sets[kBlockWords] = {};
+    meet_blocks(gather_outlines(job, begin + first, some), job.x0, job.y0, [&](int block, MaskV met) {
+      of_block[block][first / 64] |= std::uint64_t{bits(met) & real} << first % 64;
+      if constexpr (kKeep) sets[block / 32] |= keep_int(met, static_cast<std::int32_t>(1u << block % 32));
     });
-    for (int l = 0; l < kLanes; ++l) {
-      BlockSet set = static_cast<std::uint32_t>(touched[0][l]);
-      if constexpr (kWordsOf32 == 2) set |= static_cast<BlockSet>(static_cast<std::uint32_t>(touched[kWordsOf32 - 1][l])) << 32;
-      meetings.gaussians[first + l] = set;
-    }
+    if constexpr (kKeep) put_sets(sets, some, met_by + first);
   }
 }
 
@@ -201,19 +194,22 @@ CAP4D_INLINE bool draw_block(const TileJob& job, std::size_t begin, const std::u
   return going;
 }
 
-template <bool kDepth>
-void draw_tile(const TileJob& job, BlockSums<kDepth>* sums) {
+// met [job.count] where kKeep.
+template <bool kDepth, bool kKeep>
+void draw_tile(const TileJob& job, BlockSums<kDepth>* sums, BlockSet* met) {
   FloatV transmittance[kBlocks];
   BlockSet open = open_pixels(job, transmittance);
   for (int block = 0; block < kBlocks; ++block) sums[block] = BlockSums<kDepth>{}, sums[block].transmittance = transmittance[block];
-  Meetings meetings;
-  for (std::size_t begin = 0; begin < job.count && open; begin += kChunk) {
-    meet_by_block(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), meetings);
+  GaussianSet gaussians[kBlocks];
+  std::size_t begin = 0;
+  for (; begin < job.count && open; begin += kChunk) {
+    meet<kKeep>(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), gaussians, kKeep ? met + begin : nullptr);
     for (BlockSet todo = open; todo; todo &= todo - 1) {
       const int block = __builtin_ctzll(todo);
-      if (!draw_block<kDepth>(job, begin, meetings.blocks[block], block, sums[block])) open &= ~(BlockSet{1} << block);
+      if (!draw_block<kDepth>(job, begin, gaussians[block], block, sums[block])) open &= ~(BlockSet{1} << block);
     }
   }
+  if (kKeep && begin < job.count) std::fill(met + begin, met + job.count, BlockSet{0});
   for (int block = 0; block < kBlocks; ++block) sums[block].transmittance = max(sums[block].transmittance, -sums[block].transmittance);
 }
 
@@ -234,9 +230,10 @@ CAP4D_INLINE void each_pixel(const TileJob& job, int block, const Write& write) 
 
 }  // namespace
 
-void rasterize_fwd(const TileJob& job, const Image& image) {
+void rasterize_fwd(const TileJob& job, const Image& image, BlockSet* met) {
   BlockSums<true> sums[kBlocks];
-  draw_tile(job, sums);
+  if (met) draw_tile<true, true>(job, sums, met);
+  else draw_tile<true, false>(job, sums, met);
   for (int block = 0; block < kBlocks; ++block) {
     const BlockSums<true>& b = sums[block];
     const FloatV depth = keep(less(splat(0.0f), b.alpha), b.depth / b.alpha);
@@ -266,7 +263,7 @@ CAP4D_INLINE IntV byte_of(FloatV v) {
 
 void rasterize_rgba8(const TileJob& job, const Image8& image) {
   BlockSums<false> sums[kBlocks];
-  draw_tile(job, sums);
+  draw_tile<false, false>(job, sums, nullptr);
   for (int block = 0; block < kBlocks; ++block) {
     const BlockSums<false>& b = sums[block];
     FloatV color[3] = {b.red, b.green, b.blue}, alpha = splat(1.0f);
@@ -346,52 +343,75 @@ struct PixelGrads {  // dL/d of what a pixel accumulates: per Gaussian it adds w
   FloatV x[kBlocks], y[kBlocks];  // its centre, px
 };
 
-// What the loss says of a block's pixels and what the forward pass made of them; zero outside the image and where nothing is given.
-struct PixelLanes {
-  float rgb[3][kLanes], alpha[kLanes], depth[kLanes], v_rgb[3][kLanes], v_alpha[kLanes], v_depth[kLanes];
+// kComponents floats a pixel, block by block; zero outside the image.
+template <int kComponents>
+using Blocks = float[kBlocks][kComponents * kLanes];
+
+template <int kComponents>
+void gather_pixels(const TileJob& job, const float* image, Blocks<kComponents>& blocks) {
+  const std::size_t width = job.camera->width;
+  if (!whole(job)) std::memset(blocks, 0, sizeof blocks);
+  for (int block = 0; block < kBlocks; ++block) {
+    const std::size_t corner = (job.y0 + block_y(block)) * width + job.x0 + block_x(block);
+    constexpr std::size_t kRow = kComponents * kBlockWidth;
+    if (whole(job))
+      for (int row = 0; row < kBlockHeight; ++row) std::memcpy(blocks[block] + row * kRow, image + kComponents * (corner + row * width), kRow * sizeof(float));
+    else
+      each_pixel(job, block, [&](std::size_t at, int l) { std::copy_n(image + kComponents * at, kComponents, blocks[block] + kComponents * l); });
+  }
+}
+
+struct TilePixels {  // what the forward pass made of a tile's pixels and what the loss says of them; alpha and depth where it says anything
+  Blocks<3> rgb, v_rgb;
+  Blocks<1> alpha, depth, v_alpha, v_depth;
 };
 
-CAP4D_INLINE void gather_pixels(const TileJob& job, const Image& image, const ImageGrad& v, int block, PixelLanes& lanes) {
-  lanes = {};
-  each_pixel(job, block, [&](std::size_t at, int l) {
-    for (int c = 0; c < 3; ++c) lanes.rgb[c][l] = image.rgb[3 * at + c], lanes.v_rgb[c][l] = v.rgb[3 * at + c];
-    lanes.alpha[l] = image.alpha[at];
-    if (v.alpha) lanes.v_alpha[l] = v.alpha[at];
-    if (v.depth) lanes.depth[l] = image.depth[at], lanes.v_depth[l] = v.depth[at];
-  });
+void load_pixels(const TileJob& job, const Image& image, const ImageGrad& v, TilePixels& pixels) {
+  gather_pixels<3>(job, image.rgb, pixels.rgb), gather_pixels<3>(job, v.rgb, pixels.v_rgb);
+  gather_pixels<1>(job, image.alpha, pixels.alpha);
+  if (v.alpha) gather_pixels<1>(job, v.alpha, pixels.v_alpha);
+  if (v.depth) gather_pixels<1>(job, image.depth, pixels.depth), gather_pixels<1>(job, v.depth, pixels.v_depth);
 }
 
 void load_pixel_grads(const TileJob& job, const Image& image, const ImageGrad& v, PixelGrads& grads) {
+  TilePixels pixels;
+  load_pixels(job, image, v, pixels);
   for (int block = 0; block < kBlocks; ++block) {
-    PixelLanes lanes;
-    gather_pixels(job, image, v, block, lanes);
-    const FloatV alpha = load(lanes.alpha), image_depth = load(lanes.depth);
-    // depth = accumulated / alpha
-    const FloatV depth = keep(less(splat(0.0f), alpha), load(lanes.v_depth) / alpha);
-    FloatV constant = load(lanes.v_alpha) - depth * image_depth, foreground = FloatV{}, v_rgb[3];
+    FloatV rgb[3], v_rgb[3], constant{}, foreground{}, v_depth{};
+    deinterleave<3>(pixels.rgb[block], rgb), deinterleave<3>(pixels.v_rgb[block], v_rgb);
+    const FloatV alpha = load(pixels.alpha[block]);
+    if (v.alpha) constant = load(pixels.v_alpha[block]);
+    if (v.depth) {  // depth = accumulated / alpha
+      const FloatV depth = load(pixels.depth[block]);
+      v_depth = keep(less(splat(0.0f), alpha), load(pixels.v_depth[block]) / alpha);
+      constant -= v_depth * depth;
+      foreground = v_depth * depth * alpha;
+    }
     for (int c = 0; c < 3; ++c) {  // rgb = accumulated + (1 - alpha) background
       const float background = job.background[c];
-      v_rgb[c] = load(lanes.v_rgb[c]);
       constant -= v_rgb[c] * background;
-      foreground += v_rgb[c] * (load(lanes.rgb[c]) - background + background * alpha);
+      foreground += v_rgb[c] * (rgb[c] - background + background * alpha);
     }
-    foreground += constant * alpha + depth * image_depth * alpha;
+    foreground += constant * alpha;
     grads.red[block] = v_rgb[0], grads.green[block] = v_rgb[1], grads.blue[block] = v_rgb[2];
-    grads.depth[block] = depth, grads.constant[block] = constant, grads.behind[block] = foreground;
+    grads.depth[block] = v_depth, grads.constant[block] = constant, grads.behind[block] = foreground;
     grads.x[block] = load(kPixel.x) + static_cast<float>(job.x0 + block_x(block));
     grads.y[block] = load(kPixel.y) + static_cast<float>(job.y0 + block_y(block));
   }
 }
 
+// The pairs lie in the order of the caller's Gaussians, which is none here: their lines are fetched before they are written.
+constexpr std::size_t kPrefetchGrads = 8;
+
 template <bool kDepth>
-void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32_t* slots, SplatGrad* pair_grads) {
+void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const BlockSet* met, const std::uint32_t* slots, SplatGrad* pair_grads) {
   FloatV transmittance[kBlocks];
   BlockSet open = open_pixels(job, transmittance);
-  Meetings meetings;
   for (std::size_t i = 0; i < job.count; ++i) {
-    if (i % kChunk == 0 && open) meet_by_gaussian(job, i, static_cast<int>(std::min<std::size_t>(kChunk, job.count - i)), meetings);
+    if (i + kPrefetch < job.count) __builtin_prefetch(&job.splats[job.isects[i + kPrefetch]]);
+    if (i + kPrefetchGrads < job.count) __builtin_prefetch(&pair_grads[slots[i + kPrefetchGrads]], 1);
     const Splat& s = job.splats[job.isects[i]];
-    BlockSet todo = open ? open & meetings.gaussians[i % kChunk] : 0;
+    BlockSet todo = open & met[i];
     FloatV v_red{}, v_green{}, v_blue{}, v_depth{}, v_s{}, v_sx{}, v_su{}, v_sxx{}, v_sxu{}, v_suu{};
     bool touched = false;
     for (; todo; todo &= todo - 1) {
@@ -426,7 +446,8 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
       pair_grads[slots[i]] = SplatGrad{};
       continue;
     }
-    store4(out, sums4(fold4(v_red), fold4(v_green), fold4(v_blue), fold4(v_depth)));
+    const Float4 color = load4(&s.red);  // clamped at 0: the coefficients of a channel that is 0 move nothing; depth is positive
+    store4(out, positive_only(color, sums4(fold4(v_red), fold4(v_green), fold4(v_blue), fold4(v_depth))));
     store4(out + 4, sums4(fold4(v_s), fold4(v_sx), fold4(v_su), fold4(v_sxx)));
     store4(out + 8, sums4(fold4(v_sxu), fold4(v_suu), Float4{}, Float4{}));
   }
@@ -434,13 +455,14 @@ void rasterize_tile_bwd(const TileJob& job, PixelGrads& grads, const std::uint32
 
 }  // namespace
 
-void rasterize_bwd(const TileJob& job, const Image& image, const ImageGrad& v, const std::uint32_t* slots, SplatGrad* pair_grads) {
+void rasterize_bwd(const TileJob& job, const Image& image, const ImageGrad& v, const BlockSet* met, const std::uint32_t* slots,
+                   SplatGrad* pair_grads) {
   PixelGrads grads;
   load_pixel_grads(job, image, v, grads);
   if (v.depth)
-    rasterize_tile_bwd<true>(job, grads, slots, pair_grads);
+    rasterize_tile_bwd<true>(job, grads, met, slots, pair_grads);
   else
-    rasterize_tile_bwd<false>(job, grads, slots, pair_grads);
+    rasterize_tile_bwd<false>(job, grads, met, slots, pair_grads);
 }
 
 }  // namespace cap4d::CAP4D_ISA

@@ -96,11 +96,12 @@ void list_tiles(Rendered& r, Pass pass, int threads) {
   r.seconds.tiles = watch.lap();
 }
 
+// draw(the tile's job, its first place in the lists)
 template <class Draw>
 void each_tile(Rendered& r, int threads, const Draw& draw) {
   Stopwatch watch;
   parallel_for(grid_of(r.camera).count(), 1, threads, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t tile = begin; tile < end; ++tile) draw(tile_job(r, tile));
+    for (std::size_t tile = begin; tile < end; ++tile) draw(tile_job(r, tile), r.lists.offsets[tile]);
   });
   r.seconds.rasterize = watch.lap();
 }
@@ -116,7 +117,7 @@ std::size_t Rendered::bytes() const {
   std::size_t listed = 0;
   for (const Piece& piece : pieces) listed += piece.tiles.capacity() * sizeof(std::uint32_t);
   return radii.bytes() + splats.bytes() + runs.bytes() + order.bytes() + sorting.records.bytes() + sorting.places.bytes() + lists.offsets.bytes() +
-         lists.isects.bytes() + lists.slots.bytes() + lists.places.bytes() + pieces.capacity() * sizeof(Piece) + listed;
+         lists.isects.bytes() + lists.slots.bytes() + lists.places.bytes() + met.bytes() + pieces.capacity() * sizeof(Piece) + listed;
 }
 
 void render_fwd(const Camera& camera, const GaussiansView& gaussians, const float* background, Pass pass, int threads, const Image& image,
@@ -128,7 +129,8 @@ void render_fwd(const Camera& camera, const GaussiansView& gaussians, const floa
   });
   r.seconds.project = watch.lap();
   list_tiles(r, pass, threads);
-  each_tile(r, threads, [&](const TileJob& job) { kernels().rasterize_fwd(job, image); });
+  BlockSet* met = pass == Pass::kTrain ? r.met.reserve(r.pairs) : nullptr;
+  each_tile(r, threads, [&](const TileJob& job, std::uint32_t first) { kernels().rasterize_fwd(job, image, met ? met + first : nullptr); });
 }
 
 void Splatter::place_frames(const float* vertices, int threads) {
@@ -171,12 +173,12 @@ void Splatter::prepare(const View& view, int threads) {
 
 void Splatter::draw(const View& view, int threads, const Image& image) {
   prepare(view, threads);
-  each_tile(rendered_, threads, [&](const TileJob& job) { kernels().rasterize_fwd(job, image); });
+  each_tile(rendered_, threads, [&](const TileJob& job, std::uint32_t) { kernels().rasterize_fwd(job, image, nullptr); });
 }
 
 void Splatter::draw(const View& view, int threads, const Image8& image) {
   prepare(view, threads);
-  each_tile(rendered_, threads, [&](const TileJob& job) { kernels().rasterize_rgba8(job, image); });
+  each_tile(rendered_, threads, [&](const TileJob& job, std::uint32_t) { kernels().rasterize_rgba8(job, image); });
 }
 
 void Splatter::count(int threads, std::uint16_t* counts) {
@@ -185,10 +187,12 @@ void Splatter::count(int threads, std::uint16_t* counts) {
 
 void render_bwd(const Rendered& r, const GaussiansView& gaussians, const Image& image, const ImageGrad& v_image, int threads,
                 const GaussianGrads& grads) {
-  auto pair_grads = make_buffer<SplatGrad>(r.pairs);
+  auto pair_grads = make_pages<SplatGrad>(r.pairs);
   parallel_for(grid_of(r.camera).count(), 1, threads, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t tile = begin; tile < end; ++tile)
-      kernels().rasterize_bwd(tile_job(r, tile), image, v_image, r.lists.slots.get() + r.lists.offsets[tile], pair_grads.get());
+    for (std::size_t tile = begin; tile < end; ++tile) {
+      const std::uint32_t first = r.lists.offsets[tile];
+      kernels().rasterize_bwd(tile_job(r, tile), image, v_image, r.met.get() + first, r.lists.slots.get() + first, pair_grads.get());
+    }
   });
   parallel_for(r.count, kGrain, threads, [&](std::size_t begin, std::size_t end) {
     const PairGrads pairs{pair_grads.get() + r.pieces[begin / kGrain].first_pair, r.runs.get()};

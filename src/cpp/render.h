@@ -36,6 +36,7 @@ struct Rendered {
   Scratch<Drawn> order;
   SortSpace<Drawn> sorting;
   TileLists lists;
+  Scratch<BlockSet> met;  // [pairs] beside the lists; only for the gradient
   StageTimes seconds;
 
   std::size_t bytes() const;  // of all that is kept

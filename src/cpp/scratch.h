@@ -3,6 +3,8 @@
 #include <cstddef>
 #include <memory>
 
+#include "pages.h"
+
 namespace cap4d {
 
 template <class T>
@@ -21,7 +23,7 @@ class Scratch {
     if (n > capacity_ || !data_) {
       data_.reset();
       capacity_ = n + n / 8;
-      data_ = make_buffer<T>(capacity_);
+      data_ = make_pages<T>(capacity_);
     }
     return data_.get();
   }
@@ -30,7 +32,7 @@ class Scratch {
   std::size_t bytes() const { return capacity_ * sizeof(T); }
 
  private:
-  Buffer<T> data_;
+  Pages<T> data_;
   std::size_t capacity_ = 0;
 };
 

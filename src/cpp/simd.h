@@ -178,7 +178,25 @@ CAP4D_INLINE void transpose4(const FloatV* in, FloatV* out) {  // 4 x 4 within t
 #undef CAP4D_MM
 #endif
 
-// Turns 16 registers into rows of 16 floats, a row per lane, `stride` floats apart. Only rows whose bit is set are written.
+// Past the caches, whose lines it would fetch only to overwrite them; p is aligned to the register. After the last one, end_stream.
+CAP4D_INLINE void stream(float* p, FloatV v) {
+#ifdef CAP4D_AVX512
+  _mm512_stream_ps(p, v);
+#elif defined(__AVX2__)
+  _mm256_stream_ps(p, v);
+#else
+  store(p, v);
+#endif
+}
+CAP4D_INLINE void end_stream() {
+#ifdef __AVX2__
+  _mm_sfence();
+#endif
+}
+
+// Turns 16 registers into rows of 16 floats, a row per lane, `stride` floats apart. Only rows whose bit is set are written. `put` is
+// store or stream.
+template <void (*put)(float*, FloatV) = store>
 CAP4D_INLINE void store_rows16(const FloatV* columns, float* rows, std::size_t stride, std::uint32_t which) {
 #ifdef CAP4D_AVX512
   FloatV a[16], b[16];
@@ -191,15 +209,15 @@ CAP4D_INLINE void store_rows16(const FloatV* columns, float* rows, std::size_t s
     const FloatV row[4] = {_mm512_shuffle_f32x4(b[j], b[8 + j], 0x88), _mm512_shuffle_f32x4(b[j], b[8 + j], 0xdd),
                            _mm512_shuffle_f32x4(b[4 + j], b[12 + j], 0x88), _mm512_shuffle_f32x4(b[4 + j], b[12 + j], 0xdd)};
     for (int k = 0; k < 4; ++k)
-      if (which >> (4 * k + j) & 1) store(rows + stride * (4 * k + j), row[k]);
+      if (which >> (4 * k + j) & 1) put(rows + stride * (4 * k + j), row[k]);
   }
 #elif defined(__AVX2__)
   for (int half = 0; half < 16; half += 8) {
     FloatV a[8];
     transpose4(columns + half, a), transpose4(columns + half + 4, a + 4);
     for (int j = 0; j < 4; ++j) {  // a[j] holds columns 0-3 of rows j, 4 + j; a[4 + j] columns 4-7
-      if (which >> j & 1) store(rows + stride * j + half, _mm256_permute2f128_ps(a[j], a[4 + j], 0x20));
-      if (which >> (4 + j) & 1) store(rows + stride * (4 + j) + half, _mm256_permute2f128_ps(a[j], a[4 + j], 0x31));
+      if (which >> j & 1) put(rows + stride * j + half, _mm256_permute2f128_ps(a[j], a[4 + j], 0x20));
+      if (which >> (4 + j) & 1) put(rows + stride * (4 + j) + half, _mm256_permute2f128_ps(a[j], a[4 + j], 0x31));
     }
   }
 #else
@@ -241,6 +259,60 @@ CAP4D_INLINE void load_rows8(const float* const* rows, FloatV* columns) {
 #endif
 }
 
+#ifdef CAP4D_AVX512
+template <int kComponents>
+struct Interleaving {  // at[c][n]: where the lanes of row c come from when source n joins what was taken from those before it
+  std::int32_t columns[kComponents][kComponents][kLanes], items[kComponents][kComponents][kLanes];
+};
+template <int kComponents>
+constexpr Interleaving<kComponents> kInterleaving = [] {
+  Interleaving<kComponents> at{};
+  for (int c = 0; c < kComponents; ++c)
+    for (int n = 1; n < kComponents; ++n)
+      for (int l = 0; l < kLanes; ++l) {
+        const int item = kComponents * l + c, flat = kLanes * c + l;  // where lane l of column c lies; what lane l of row c is
+        const auto from = [&](int source, int lane) { return source == n ? kLanes + lane : n == 1 ? lane : l; };
+        at.columns[c][n][l] = from(item / kLanes, item % kLanes);
+        at.items[c][n][l] = from(flat % kComponents, flat / kComponents);
+      }
+  return at;
+}();
+template <int kComponents>
+CAP4D_INLINE FloatV merge(const FloatV* sources, const std::int32_t (*at)[kLanes]) {
+  FloatV merged = sources[0];
+  for (int n = 1; n < kComponents; ++n) merged = _mm512_permutex2var_ps(merged, _mm512_loadu_si512(at[n]), sources[n]);
+  return merged;
+}
+#endif
+
+// Component c of each of kLanes items that lie one after the other: an array of structures as registers.
+template <int kComponents>
+CAP4D_INLINE void deinterleave(const float* items, FloatV* columns) {
+#ifdef CAP4D_AVX512
+  FloatV rows[kComponents];
+  for (int n = 0; n < kComponents; ++n) rows[n] = load(items + kLanes * n);
+  for (int c = 0; c < kComponents; ++c) columns[c] = merge<kComponents>(rows, kInterleaving<kComponents>.columns[c]);
+#else
+  float lanes[kComponents][kLanes];
+  for (int l = 0; l < kLanes; ++l)
+    for (int c = 0; c < kComponents; ++c) lanes[c][l] = items[kComponents * l + c];
+  for (int c = 0; c < kComponents; ++c) columns[c] = load(lanes[c]);
+#endif
+}
+
+// The way back.
+template <int kComponents>
+CAP4D_INLINE void interleave(const FloatV* columns, float* items) {
+#ifdef CAP4D_AVX512
+  for (int n = 0; n < kComponents; ++n) store(items + kLanes * n, merge<kComponents>(columns, kInterleaving<kComponents>.items[n]));
+#else
+  float lanes[kComponents][kLanes];
+  for (int c = 0; c < kComponents; ++c) store(lanes[c], columns[c]);
+  for (int l = 0; l < kLanes; ++l)
+    for (int c = 0; c < kComponents; ++c) items[kComponents * l + c] = lanes[c][l];
+#endif
+}
+
 // About 1 / x for normal x, relative error below 3e-7.
 CAP4D_INLINE FloatV reciprocal(FloatV x) {
 #ifdef CAP4D_AVX512
@@ -249,6 +321,12 @@ CAP4D_INLINE FloatV reciprocal(FloatV x) {
 #else
   return 1.0f / x;
 #endif
+}
+
+// `v` where `sign` is above 0; else 0.
+CAP4D_INLINE Float4 positive_only(Float4 sign, Float4 v) {
+  typedef std::int32_t Int4 __attribute__((vector_size(16)));
+  return reinterpret_cast<Float4>((sign > 0.0f) & reinterpret_cast<Int4>(v));
 }
 
 // Sum of the lanes, in a fixed order.

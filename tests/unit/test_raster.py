@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 
+import numpy as np
 import pytest
 import torch
 from splat_scenes import cloud, view
 from torch import Tensor
 
+from cap4d import _core
 from cap4d.camera import Camera
 from cap4d.errors import ArgumentError
 from cap4d.raster import Rasterized, rasterize
@@ -60,6 +62,29 @@ def test_two_pictures_of_one_scene_add_their_gradients() -> None:
     sum(rasterize(*twice, camera=c).rgb.sum() for c in (view(), view(yaw_deg=-40))).backward()
     for a, b in zip(once, twice, strict=True):
         torch.testing.assert_close(a.grad, b.grad)
+
+
+def test_large_gradients_stand_apart_while_they_are_held() -> None:
+    """Their memory is used again, but only then."""
+    g, camera = cloud(12_000), view()
+    fields = g.means, g.quats, g.scales, g.opacities, g.sh
+    seen = camera.viewmat, camera.K, camera.width, camera.height
+
+    def v_sh(factor: float) -> np.ndarray:
+        rgb, alpha, depth, _, _, rendered = _core.rasterize(*fields, *seen, None, -1, 2)
+        v_rgb = np.full_like(rgb, factor)
+        return _core.rasterize_vjp(rendered, *fields, -1, rgb, alpha, depth, v_rgb, None, None, 2)[4]
+
+    first = v_sh(1)
+    assert first.nbytes > 2 << 20 and first.ctypes.data % 64 == 0
+    once = first.copy()
+    assert once.any()
+    second = v_sh(2)
+    np.testing.assert_array_equal(first, once)
+    np.testing.assert_allclose(second, 2 * once, rtol=1e-4, atol=1e-6)
+    del first
+    np.testing.assert_array_equal(v_sh(1), once)
+    np.testing.assert_allclose(second, 2 * once, rtol=1e-4, atol=1e-6)
 
 
 def test_double_inputs_get_double_gradients() -> None:
