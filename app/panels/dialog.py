@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cap4d.app.layout import Rect
-from cap4d.app.panels.widgets import ImVec2, quiet, tip
+from cap4d.app.panels.widgets import ImVec2, choice, quiet, tip
 from cap4d.app.shortcuts import Action
 from cap4d.app.viewer import Viewer
 from imgui_bundle import imgui
@@ -14,6 +14,13 @@ TITLES = {Action.OPEN: "Open a file", Action.DRIVE: "Listen to a live source"}
 HINTS = {
     Action.OPEN: "path of a .cap4d, .npz or .npy file",
     Action.DRIVE: "tcp://127.0.0.1:9000",
+}
+ADDRESSES = {
+    "tcp://127.0.0.1:9000": "lines of JSON",
+    "ws://127.0.0.1:9001": "lines of JSON, from a web page",
+    "livelink://127.0.0.1:11111": "Live Link Face",
+    "vmc://127.0.0.1:39539": "VMC, face trackers",
+    "webcam://0": "a camera",
 }
 WIDTH = 460.0  # units of design
 FLAGS = (
@@ -41,6 +48,8 @@ class Dialog:
             self._draw_field(viewer, asks, appearing)
             if asks is Action.OPEN:
                 _draw_recent(viewer)
+            else:
+                self._draw_examples()
         imgui.end()
         if not stays:
             viewer.dialog = None
@@ -63,6 +72,14 @@ class Dialog:
                 viewer.open(Path(text).expanduser())
             else:
                 viewer.drive(text)
+
+
+    def _draw_examples(self) -> None:
+        imgui.spacing()
+        quiet("Addresses")
+        for address, text in ADDRESSES.items():
+            if choice(address, self.text == address, text):
+                self.text = address
 
 
 def _draw_recent(viewer: Viewer) -> None:
