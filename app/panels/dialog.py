@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cap4d.app.layout import Rect
-from cap4d.app.panels.widgets import ImVec2, choice, quiet, tip
+from cap4d.app.panels.widgets import ImVec2, choice, quiet, tip, units
 from cap4d.app.shortcuts import Action
 from cap4d.app.viewer import Viewer
 from imgui_bundle import imgui
@@ -24,7 +24,10 @@ ADDRESSES = {
 }
 WIDTH = 460.0  # units of design
 FLAGS = (
-    imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_move
+    imgui.WindowFlags_.always_auto_resize
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_collapse
+    | imgui.WindowFlags_.no_move
 )
 
 
@@ -58,7 +61,7 @@ class Dialog:
         if appearing:
             self.text = ""
             imgui.set_keyboard_focus_here()
-        imgui.set_next_item_width(WIDTH * imgui.get_style().font_scale_dpi)
+        imgui.set_next_item_width(units(WIDTH))
         entered, self.text = imgui.input_text_with_hint(
             "##text", HINTS[asks], self.text, imgui.InputTextFlags_.enter_returns_true
         )
@@ -72,7 +75,6 @@ class Dialog:
                 viewer.open(Path(text).expanduser())
             else:
                 viewer.drive(text)
-
 
     def _draw_examples(self) -> None:
         imgui.spacing()

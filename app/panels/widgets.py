@@ -22,6 +22,11 @@ SLIDER = imgui.SliderFlags_.always_clamp | imgui.SliderFlags_.no_round_to_format
 HIDDEN_GRAB = (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active)
 
 
+def units(design: float) -> float:
+    """Window units of so many units of design."""
+    return design * imgui.get_style().font_scale_dpi
+
+
 @cache
 def color32(color: Color, opacity: float = 1.0) -> int:
     """A colour as draw lists take it."""
@@ -131,8 +136,8 @@ def choice(label: str, chosen: bool, note: str = "") -> bool:
     height = imgui.get_text_line_height()
     y = (least.y + most.y - height) / 2
     if chosen:
-        draw.add_circle_filled(ImVec2(least.x + pad + 3, y + height / 2), 3, color32(ACCENT))
-    draw.add_text(ImVec2(least.x + pad + 14, y), color32(TEXT if chosen else QUIET), label)
+        draw.add_circle_filled(ImVec2(least.x + pad + units(3), y + height / 2), units(3), color32(ACCENT))
+    draw.add_text(ImVec2(least.x + pad + units(14), y), color32(TEXT if chosen else QUIET), label)
     size = imgui.calc_text_size(note)
     draw.add_text(ImVec2(most.x - pad - size.x, y), color32(QUIET), note)
     return picked
