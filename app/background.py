@@ -8,7 +8,6 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from cap4d.app.letterbox import scaled
 from cap4d.app.shader_source import build_program
 
 from cap4d.errors import ArgumentError, DataError
@@ -63,10 +62,6 @@ class Picture:
         except (av.FFmpegError, OSError, ValueError) as error:
             found = getattr(error, "strerror", None) or str(error)
             raise DataError(path, "image", expected="one that can be decoded", found=found[:200]) from None
-        longest = max(pixels.shape[:2])
-        if longest > MAX_SIDE:
-            size = [max(1, round(side * MAX_SIDE / longest)) for side in pixels.shape[1::-1]]
-            pixels = scaled(pixels, (size[0], size[1]))
         return cls(pixels)
 
 
@@ -150,7 +145,9 @@ def _decoded(path: Path) -> np.ndarray:
 
     limit = {"max_pixels": str(MAX_PIXELS)}
     with av.open(str(path), format=_format(path), options=limit) as file:
-        context: Any = file.streams.video[0].codec_context
+        context: Any = file.streams.video[0].codec_context if file.streams.video else None
+        if context is None:
+            raise DataError(path, "image", expected="one that can be decoded", found="an unknown kind")
         if not 1 <= context.width * context.height <= MAX_PIXELS:
             found = f"{context.width}x{context.height}" if context.width else "more, or none"
             raise DataError(path, "size", expected=f"at most {MAX_PIXELS} px", found=found)
@@ -158,10 +155,20 @@ def _decoded(path: Path) -> np.ndarray:
         frame = next(file.decode(video=0), None)
         if frame is None:
             raise DataError(path, "image", expected="a picture", found="none")
-        turns, image = frame.rotation // 90, frame.to_ndarray(format="rgba")
+        turns, image = frame.rotation // 90, _shrunk(frame)
     alpha = image[..., 3:].astype(np.uint16)
     on_white = image[..., :3] if alpha.min() == 255 else (image[..., :3] * alpha + 255 * (255 - alpha)) // 255
     return np.ascontiguousarray(np.rot90(on_white, turns).astype(np.uint8))
+
+
+def _shrunk(frame: Any) -> np.ndarray:
+    """uint8[H, W, 4], no side longer than `MAX_SIDE`: no four bytes for every pixel of a large image."""
+    from av.video.reformatter import Interpolation
+
+    scale = min(1.0, MAX_SIDE / max(frame.width, frame.height))
+    width, height = (max(1, round(side * scale)) for side in (frame.width, frame.height))
+    small = frame.reformat(width, height, format="rgba", interpolation=Interpolation.AREA)
+    return small.to_ndarray()
 
 
 def _format(path: Path) -> str:

@@ -26,10 +26,14 @@ from cap4d.player.video import MAX_SIDE, VideoWriter, check_output
 
 log = logging.getLogger(__name__)
 
-PRESET = "veryfast"  # of x264: at 512 x 512 a third of `medium`'s time for a tenth more bytes
+PRESETS = "veryfast", "ultrafast"  # of x264
+FAST_FROM = (
+    4e7  # px a second: above it two busy cores keep up with the second only (1920 x 1080 at 30 is 6.2e7)
+)
 QUEUED_BYTES = 96 << 20  # of pictures that wait for the encoder
 QUEUED = (2, 12)  # that may wait whatever their size, and at most
 MAX_GAP = 60.0  # s without a picture that the video shows; longer ones are cut to this
+HEARD_ON = 0.5  # s without a picture in which sound goes on; a window that is paused shows no new ones
 NICENESS = 10  # of the encoder, where threads can be nice: the window comes first
 
 SoundAt = Callable[[], float | None]
@@ -83,6 +87,7 @@ class Recorder:
         self.frames = 0  # of the video so far
         self.repeated = 0  # pictures that came in time, but the encoder was behind
         self._sound_at = sound_at
+        self._spare: list[np.ndarray] = []  # pictures that were encoded: memory whose pages are there already
         self._shots: queue.SimpleQueue[_Shot | None] = queue.SimpleQueue()
         self._waiting = self._bytes = 0
         self._lock = threading.Lock()
@@ -132,7 +137,9 @@ class Recorder:
             self.repeated += 1
             return False
         self._slot = slot
-        self._shots.put(_Shot(np.array(image), slot, self._heard()))
+        copy = self._memory(image.shape)
+        np.copyto(copy, image)
+        self._shots.put(_Shot(copy, slot, self._heard()))
         return True
 
     def close(self) -> None:
@@ -173,9 +180,19 @@ class Recorder:
                 return True
         return False
 
-    def _make_free(self, size: int) -> None:
+    def _make_free(self, size: int, unused: np.ndarray | None) -> None:
+        """A picture of `size` bytes waits no longer; the memory of the one before it is `unused` now."""
         with self._lock:
             self._waiting, self._bytes = self._waiting - 1, self._bytes - size
+            if unused is not None:
+                self._spare.append(unused)
+
+    def _memory(self, shape: tuple[int, ...]) -> np.ndarray:
+        with self._lock:
+            self._spare = [image for image in self._spare if image.shape == shape][: QUEUED[1]]
+            if self._spare:
+                return self._spare.pop()
+        return np.empty(shape, np.uint8)
 
     def _heard(self) -> float | None:
         if self.sound is None or self._sound_at is None:
@@ -192,14 +209,17 @@ class Recorder:
             log.error("recording: %s: %s", self.path, getattr(error, "strerror", None) or error)
 
     def _write(self) -> None:
-        last: _Shot | None = None
-        with VideoWriter(self.path, fps=self.fps, sound=self.sound, preset=PRESET) as video:
+        last, shown = None, None  # the picture as the video has it, and as it came
+        rate = self.size[0] * self.size[1] * self.fps
+        preset = PRESETS[rate > FAST_FROM]
+        with VideoWriter(self.path, fps=self.fps, sound=self.sound, preset=preset) as video:
             while (shot := self._shots.get()) is not None:
                 if last is not None:
                     self._repeat(video, last, shot.slot)
                 last = _Shot(letterboxed(shot.image, self.size), shot.slot, shot.sound_at)
                 self._write_one(video, last, 0.0)
-                self._make_free(shot.image.nbytes)
+                self._make_free(shot.image.nbytes, shown)
+                shown = shot.image
             if last is not None:
                 self._repeat(video, last, self._last + 1)
 
@@ -210,7 +230,9 @@ class Recorder:
 
     def _write_one(self, video: VideoWriter, shot: _Shot, later: float) -> None:
         at = shot.sound_at
-        video.write(shot.image, sound_at=None if at is None else at + later)
+        if at is not None:
+            at = at + later if later <= HEARD_ON else math.nan
+        video.write(shot.image, sound_at=at)
         self.frames += 1
 
 

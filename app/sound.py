@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import sys
 import threading
@@ -27,7 +28,8 @@ log = logging.getLogger(__name__)
 PERIOD_MS = 20  # that the device asks for at once
 PERIODS = 4  # that it keeps: what Python's other threads may take before the sound breaks off
 SPEEDS = 0.1, 8.0
-RAMP_SECONDS = 0.005  # in which a sound swells where it starts or is sought to: else it clicks
+RAMP_SECONDS = 0.005  # in which a sound swells and fades where it starts, stops or jumps: else it clicks
+MAX_POSITION = 1e6  # s
 
 Fill = Callable[[int], np.ndarray]
 """(frames) -> int16[frames, C]: called by the device's own thread."""
@@ -125,6 +127,7 @@ class SoundPlayer:
         self._start = 0.0  # position at which playing was started, s
         self._handed = 0  # samples given to the device since
         self._gain = 0.0  # of the last sample given
+        self._next = self._tail = np.zeros(0)  # sample numbers that would follow it; those that fade out now
         self._heard = SoundClock(device.latency if device is not None else 0.0)
         if device is not None:
             device.start(self._fill)
@@ -171,9 +174,10 @@ class SoundPlayer:
                 self._restart(at)
 
     def seek(self, position: float) -> None:
-        """Goes on, or stands, at `position` s; not before 0."""
+        """Goes on, or stands, at `position` s; not before 0. What is no number is ignored."""
         with self._lock:
-            self._restart(max(float(position), 0.0))
+            if math.isfinite(position):
+                self._restart(min(max(float(position), 0.0), MAX_POSITION))
 
     def position(self) -> float:
         """What is heard now, s; while playing it never goes back."""
@@ -204,6 +208,7 @@ class SoundPlayer:
 
     def _restart(self, at: float) -> None:
         self._start, self._handed, self._gain = at, 0, 0.0
+        self._tail, self._next = self._next, np.zeros(0)
         self._heard.restart()
         if self._device is None:  # what is asked for at once is heard at once
             self._heard.gulp(0.0, self._clock())
@@ -211,13 +216,25 @@ class SoundPlayer:
     def _fill(self, count: int) -> np.ndarray:
         """int16[count, C]: what follows what was given."""
         with self._lock:
-            if not self._playing:
-                return np.zeros((count, self.sound.channels), np.int16)
-            rate, step = self.sound.rate, self._speed
-            self._heard.gulp(self._handed / rate, self._clock())
-            first = self._start * rate + self._handed * step
-            self._handed += count
-        return self._swelling(self._samples(first + step * np.arange(count)))
+            out = (
+                self._playing_on(count) if self._playing else np.zeros((count, self.sound.channels), np.int16)
+            )
+            tail, self._tail = self._tail[:count], np.zeros(0)
+        if len(tail):
+            gains = np.linspace(1, 0, len(tail), endpoint=False)[:, None]
+            faded = out[: len(tail)] + self._samples(tail) * gains
+            out[: len(tail)] = np.clip(np.rint(faded), -32768, 32767)
+        return out
+
+    def _playing_on(self, count: int) -> np.ndarray:
+        rate, step = self.sound.rate, self._speed
+        self._heard.gulp(self._handed / rate, self._clock())
+        at = self._start * rate + (self._handed + np.arange(count)) * step
+        self._handed += count
+        out = self._swelling(self._samples(at))
+        if self._gain == 1:
+            self._next = at[-1] + step * np.arange(1, round(RAMP_SECONDS * rate) + 1)
+        return out
 
     def _samples(self, at: np.ndarray) -> np.ndarray:
         """int16[n, C] at sample numbers float64[n], those between samples interpolated."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-STEPS = 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0
+STEPS = 1.0, 1.2, 1.6, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0  # whose quarters are short
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ def ticks(limit: float) -> tuple[tuple[float, str], ...]:
 
 
 def rounded_up(value: float) -> float:
-    """The next of ... 0.7, 1, 1.5, 2, 3, 5, 7, 10, ...: a limit that stays while values move a little."""
+    """The next of `STEPS` times a power of ten: a limit that stays while values move a little."""
     if not value > 0:
         return STEPS[0]
     power = 10.0 ** math.floor(math.log10(value))

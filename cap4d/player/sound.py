@@ -80,6 +80,8 @@ def _read(path: Path, container: Any) -> Sound:
     if not container.streams.audio:
         raise DataError(path, "audio", expected="a stream of sound", found="none")
     context = container.streams.audio[0].codec_context
+    if context is None:
+        raise DataError(path, "samples", expected="plain ones (PCM)", found="an unknown kind")
     channels, rate = context.channels, context.sample_rate or 0
     if not 1 <= channels <= MAX_CHANNELS:
         raise DataError(path, "channels", expected=f"1 to {MAX_CHANNELS}", found=channels)

@@ -80,7 +80,7 @@ class Surface:
             self._core.deform(out, self._answer, self.threads)
 
     def deformation(self) -> np.ndarray:
-        """float32[G, 3] m, head frame, OpenCV axes: what the network or its stand-in moved in the last frame."""
+        """float32[G, 3] m, head frame, OpenCV axes: what the network or its stand-in moved last frame."""
         moved = self._neutral_answer.copy()
         where = self._deformable
         if self._answer is not None:

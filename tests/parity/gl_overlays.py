@@ -20,7 +20,9 @@ CLOSE = 0.56  # m
 
 @cache
 def avatar() -> Avatar:
-    return Avatar(tiny_bundle(12, sh_degree=1, network=False))
+    bundle = tiny_bundle(12, sh_degree=1, network=False)
+    moved = 1e-3 * np.sin(bundle.grid.pixels[:, :1] * [0.5, 0.7, 0.9]).astype(np.float32)
+    return Avatar(replace(bundle, deform_neutral=moved))
 
 
 def near() -> Camera:
@@ -73,6 +75,8 @@ def draw_on_gl(output: str) -> None:
             found[f"face {index} {samples}"] = surface(grid.faces[index : index + 1], samples)[..., 3]
     found["mesh"] = surface(grid.faces, 0, "overlay_mesh")
     found["lone mesh"] = surface(grid.faces[lone_faces()[3]][None], 0, "overlay_mesh")
+    inside_out = grid.faces[lone_faces()[3]][None, ::-1]
+    found["inside out"] = surface(np.ascontiguousarray(inside_out), 0, "overlay_mesh")
     found["outline"] = surface(grid.faces, 0)[..., 3]
 
     for renderer in (GlRenderer(ctx, player), CpuRenderer(ctx, player, background=None)):

@@ -80,6 +80,12 @@ def test_lines_are_the_edges(found, vertices):
     assert line[int(y), int(x)] < 20 and line.max() > 200
 
 
+def test_what_is_seen_from_inside_is_dim(found):
+    outside, inside = found["lone mesh"][..., 3].astype(int), found["inside out"][..., 3].astype(int)
+    lines = outside > 150
+    assert np.abs(inside[lines] / outside[lines] - 0.25).max() < 0.1
+
+
 def test_what_is_hidden_does_not_show(found):
     """The ball's far side has as many lines; they are not under those of the near side."""
     alpha = found["mesh"][..., 3]
@@ -96,7 +102,7 @@ def test_nothing_shown_changes_nothing(renderer, found):
 def test_both_renderers_get_the_same_overlay(kinds, found):
     gl, cpu = found[f"gl {kinds}"].astype(int), found[f"cpu {kinds}"].astype(int)
     changed = (gl != PLAIN).any(-1)
-    assert 0.2 < changed.mean() < 1 and gl[changed].std(0)[:3].max() > 4
+    assert 0.2 < changed.mean() < 1 and gl[changed].std(0)[:3].max() > 12
     assert (np.abs(gl - cpu).max(-1) > 12).mean() < 5e-3 and (gl[..., 3] == 255).all()
 
 

@@ -13,6 +13,7 @@ from cap4d.app import background as background_module
 from cap4d.app.background import CHECK_PX, Backdrop, Checkerboard, Picture, cover
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.renderers import CpuRenderer, GlRenderer
+from cap4d.app.screenshot import save_screenshot, straight
 from tiny_bundle import tiny_bundle
 
 from cap4d.errors import ArgumentError, DataError
@@ -64,6 +65,17 @@ def test_large_images_are_kept_smaller(tmp_path: Path, monkeypatch: pytest.Monke
     write_png(tmp_path / "a.png", halves(128, 64))
     found = Picture.load(tmp_path / "a.png").pixels
     assert found.shape == (16, 32, 3) and found[8, 4].tolist() == pytest.approx([250, 0, 0], abs=3)
+
+
+def test_photos_are_turned_upright(tmp_path: Path) -> None:
+    """As their EXIF says: red was on the left before."""
+    photo = save_with_av(tmp_path / "a.jpg", halves(), "mjpeg", "yuvj444p").read_bytes()
+    for orientation, red in ((1, (16, 8)), (3, (16, 56)), (6, (8, 16)), (8, (56, 16))):
+        entry = struct.pack(">HHHIHH", 1, 0x112, 3, 1, orientation, 0)
+        exif = b"Exif\0\0MM\0*\0\0\0\x08" + entry + bytes(4)
+        segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
+        (tmp_path / "b.jpg").write_bytes(photo[:2] + segment + photo[2:])
+        assert Picture.load(tmp_path / "b.jpg").pixels[red].argmax() == 0
 
 
 def bomb(side: int) -> bytes:
@@ -171,6 +183,24 @@ def test_images_of_odd_widths_and_one_pixel(ctx) -> None:
         == [[[77] * 3] * 48] * 48
     )
     assert laid(ctx, clear(1, 1), Picture(np.full((1, 1, 3), 9, np.uint8))).tolist() == [[[9, 9, 9, 255]]]
+
+
+def test_a_screenshot_without_a_background_has_straight_alpha(ctx, tmp_path: Path) -> None:
+    avatar = Avatar(tiny_bundle(network=False))
+    frame, camera = avatar.idle.frame(3), avatar.camera.resized(70, 50)
+    expected = avatar.splat(avatar.move(frame), camera).astype(int)
+    for renderer in (GlRenderer(ctx, avatar), CpuRenderer(ctx, avatar, background=None)):
+        picture = renderer.texture(frame, camera)
+        target = ctx.simple_framebuffer((70, 50))
+        target.use()
+        Backdrop(ctx).draw(picture, None)
+        image = np.frombuffer(target.read(components=4), np.uint8).reshape(50, 70, 4)
+        path = save_screenshot(tmp_path, straight(image), name=renderer.name)
+        with av.open(str(path)) as file:
+            found = next(file.decode(video=0)).to_ndarray(format="rgba").astype(int)
+        assert np.abs(found[..., 3] - expected[..., 3]).max() <= 2
+        solid = expected[..., 3] > 100  # a level of a premultiplied colour is more of a faint one
+        assert np.abs(found - expected)[solid].max() <= 4 and (found[..., 3] == 0).any()
 
 
 def test_both_backends_give_premultiplied_pictures(ctx) -> None:

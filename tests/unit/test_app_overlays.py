@@ -10,7 +10,14 @@ pytest.importorskip("onnx")
 from dataclasses import replace
 
 from cap4d.app.overlays.color_map import color_map
-from cap4d.app.overlays.legend import rounded_up, ticks
+from cap4d.app.background import Backdrop, Checkerboard
+from cap4d.app.gl_context import GlUnavailableError, headless_context
+from cap4d.app.layout import Rect
+from cap4d.app.overlays.legend import Legend, rounded_up, ticks
+from cap4d.app.overlays.overlays import Overlay, Overlays, Part
+from cap4d.app.panels.legends import draw_legends
+from cap4d.app.renderers import CpuRenderer, GlRenderer
+from imgui_bundle import imgui
 from tiny_bundle import tiny_bundle
 
 from cap4d.player.avatar import Avatar
@@ -38,11 +45,11 @@ def test_colours_are_those_of_matplotlib() -> None:
         (0.0, 1),
         (float("nan"), 1),
         (-3, 1),
-        (0.011, 0.015),
+        (0.011, 0.012),
         (1, 1),
-        (1.2, 1.5),
+        (1.3, 1.6),
         (30, 30),
-        (71, 100),
+        (81, 100),
         (2999, 3000),
     ],
 )
@@ -87,3 +94,82 @@ def test_asking_for_it_changes_nothing() -> None:
     before = avatar.move(frame).copy()
     avatar.deformation()[:] = 7
     np.testing.assert_array_equal(avatar.move(frame), before)
+
+
+# With a context
+
+
+@pytest.fixture(scope="module")
+def ctx():
+    try:
+        context = headless_context()
+    except GlUnavailableError as error:
+        pytest.skip(str(error))
+    yield context
+    context.gc()
+    context.release()
+
+
+@pytest.mark.parametrize("kind", [GlRenderer, CpuRenderer])
+def test_the_window_may_have_any_size(kind, ctx) -> None:
+    avatar = Avatar(tiny_bundle(network=False))
+    renderer = kind(ctx, avatar) if kind is GlRenderer else kind(ctx, avatar, background=None)
+    overlays, backdrop = Overlays(ctx, avatar), Backdrop(ctx)
+    overlays.shown = set(Overlay)
+    for size in ((1, 1), (3, 400), (200, 120), (1, 1), (1500, 40)):
+        camera, target = avatar.camera.resized(*size), ctx.simple_framebuffer(size)
+        picture = renderer.texture(avatar.idle.frame(1), camera)
+        target.use()
+        backdrop.draw(picture, Checkerboard(), upright=True)
+        overlays.draw(renderer, camera, upright=True)
+        ctx.gc()
+        assert ctx.error == "GL_NO_ERROR" and len(target.read()) == 3 * size[0] * size[1]
+
+
+def test_what_is_not_shown_is_not_made(ctx) -> None:
+    avatar = Avatar(tiny_bundle(network=False))
+    renderer, overlays = CpuRenderer(ctx, avatar), Overlays(ctx, avatar)
+    renderer.texture(avatar.idle.frame(0), avatar.camera)
+    overlays.draw(renderer, avatar.camera)
+    assert vars(overlays)["_surface"] is vars(overlays)["_density"] is None and overlays.legends() == []
+
+
+def test_limits_grow_and_legends_say_what_is_shown(ctx) -> None:
+    avatar = Avatar(tiny_bundle(), deformer="full")
+    renderer, overlays = CpuRenderer(ctx, avatar), Overlays(ctx, avatar)
+    renderer.texture(avatar.idle.frame(3), avatar.camera)
+    target = ctx.simple_framebuffer((32, 32))
+    target.use()
+    overlays.shown = {Overlay.DEFORMATION, Overlay.DENSITY}
+    overlays.draw(renderer, avatar.camera.resized(32, 32))
+    density, deformation = overlays.legends()
+    assert (density.title, deformation.title) == ("Gaussians per pixel", "Deformation, mm")
+    percentile = np.percentile(overlays.deformation_mm(), 98)
+    assert percentile <= overlays.limits_mm[Part.ALL] <= 1.6 * percentile
+    overlays.limits_mm[Part.ALL] = 1000.0
+    overlays.draw(renderer, avatar.camera.resized(32, 32))
+    assert overlays.legends()[1].ticks[-1] == (1.0, "1e+03+")
+    overlays.part = Part.EXPRESSION
+    assert overlays.legends()[1].title == "Deformation by expression, mm"
+    assert (overlays.deformation_mm()[~avatar.bundle.grid.deformable] == 0).all()
+
+
+def test_legends_are_drawn() -> None:
+    context = imgui.create_context()
+    try:
+        io = imgui.get_io()
+        io.set_ini_filename("")
+        io.display_size = imgui.ImVec2(400, 300)
+        io.backend_flags |= imgui.BackendFlags_.renderer_has_textures
+        corners = []
+        for legends in ([], [Legend("Gaussians per pixel", color_map("magma"), ticks(20.0))]):
+            for _ in range(2):  # a panel that finds its size is hidden at first
+                imgui.new_frame()
+                draw_legends(legends, Rect(0, 0, 400, 300))
+                imgui.render()
+            corners.append(imgui.get_draw_data().total_vtx_count)
+        assert corners[0] == 0 and corners[1] > 4 * 16 + 4 * len("Gaussiansperpixel")
+    finally:
+        for texture in imgui.get_platform_io().textures:
+            texture.set_status(imgui.ImTextureStatus.destroyed)
+        imgui.destroy_context(context)

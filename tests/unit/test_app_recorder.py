@@ -12,6 +12,7 @@ import pytest
 from cap4d.app import recorder as recorder_module
 from cap4d.app.letterbox import letterboxed
 from cap4d.app.recorder import QUEUED, Recorder
+from cap4d.app.sound import SoundPlayer
 from wav_files import click
 
 from cap4d.errors import ArgumentError
@@ -128,6 +129,56 @@ def test_sound_goes_with_the_pictures(tmp_path: Path) -> None:
         parts = [frame.to_ndarray()[0] for frame in file.decode(audio=0)]
     loud = np.flatnonzero(np.abs(np.concatenate(parts)) > 0.1) / 48000
     assert loud[0] == pytest.approx(0.3, abs=2e-3) and loud[-1] < 0.32
+
+
+class SteadyDevice:
+    """Asks for 20 ms at a time."""
+
+    latency = 0.06
+
+    def start(self, fill):
+        self.fill = fill
+
+    def close(self):
+        pass
+
+
+def test_what_is_played_paused_and_repeated_is_recorded_in_step(tmp_path: Path) -> None:
+    """The picture is white while the player says that the click is heard; so it is in the file."""
+    rate, fps, now = 48000, 50, [0.0]
+    device, sound = SteadyDevice(), Sound(click(0.62, seconds=0.8, rate=rate), rate)
+    player = SoundPlayer(sound, device, loop=0.8, clock=lambda: now[0])
+    recorder = Recorder(tmp_path / "a.mp4", (32, 32), fps, sound, sound_at=player.heard, start=False)
+    keys = {20: player.play, 40: player.pause, 60: player.play}
+    recorder._thread.start()
+    for k in range(200):
+        now[0] = k / fps
+        keys.get(k, lambda: None)()
+        device.fill(rate // fps)
+        white = player.playing and abs(player.position() % 0.8 - 0.62) < 0.5 / fps
+        while not recorder.add(grey(250 * white), now[0]):
+            recorder.repeated -= 1  # this test waits for the encoder
+    recorder.close()
+    flashes = np.flatnonzero(np.array(levels(tmp_path / "a.mp4")) > 200) / fps
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        samples = np.concatenate([frame.to_ndarray()[0] for frame in file.decode(audio=0)])
+    loud = np.flatnonzero(np.abs(samples) > 0.1) / rate
+    clicks = loud[np.diff(loud, prepend=-1) > 0.1]
+    assert len(flashes) == len(clicks) == 4
+    assert np.abs(flashes - clicks).max() <= 1 / fps
+
+
+def test_a_gap_in_the_pictures_is_a_pause_of_the_sound(tmp_path: Path) -> None:
+    loud = Sound(np.full((96000, 1), 9000, np.int16), 48000)
+    recorder = Recorder(tmp_path / "a.mp4", (32, 32), 10, loud, sound_at=lambda: 0.0, start=False)
+    recorder.add(grey(0), 0.0)
+    recorder.add(grey(0), 1.9)
+    recorder._thread.start()
+    recorder.close()
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        samples = np.concatenate([frame.to_ndarray()[0] for frame in file.decode(audio=0)])
+    tenths = np.abs(samples[: 48000 * 2].reshape(20, -1)).mean(1) > 0.1
+    assert tenths.tolist() == [True] * 6 + [False] * 13 + [True]
 
 
 def test_there_is_no_file_before_the_end_and_none_without_pictures(tmp_path: Path) -> None:
