@@ -36,7 +36,11 @@ def play(options: Options) -> None:
 
     avatar = options.avatar if options.avatar is not None else demo_avatar()
     read_manifest(avatar)  # before a window opens for what is no avatar
-    if options.headless or options.out is not None or not play_in_window(avatar, options):
+    if options.serve is not None:
+        from cap4d.app.serve.play import play_page
+
+        play_page(avatar, options)
+    elif options.headless or options.out is not None or not play_in_window(avatar, options):
         from cap4d.app.headless import play_headless
 
         play_headless(avatar, options)

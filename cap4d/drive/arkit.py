@@ -53,6 +53,8 @@ class ArkitMap:
         missing: Names that the rig cannot show; their weights do nothing (`eyeLook*` still turn the eyes).
         error_mm: float32[52] how far the rig's shape is from the one asked for, root mean square over the
             points that this moves at all; 0 where it is the rig's own.
+        rest: float32[52] the weights that the rig's neutral face stands at: 0, but for FLAME's jaw in an
+            edition whose neutral mouth is open; None is 0.
     """
 
     rig_name: str
@@ -60,10 +62,13 @@ class ArkitMap:
     jaw_rot: np.ndarray
     missing: tuple[str, ...]
     error_mm: np.ndarray
+    rest: np.ndarray | None = None
 
     def __call__(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """float32 [..., 52] -> expr [..., E], eye_rot [..., 3], jaw_rot [..., 3] rad."""
-        return weights @ self.expr.T, gaze_of(weights), weights @ self.jaw_rot.T
+        eye_rot = gaze_of(weights)
+        weights = weights if self.rest is None else weights - self.rest
+        return weights @ self.expr.T, eye_rot, weights @ self.jaw_rot.T
 
 
 def arkit_map(bundle: Bundle) -> ArkitMap:
@@ -75,6 +80,10 @@ def arkit_map(bundle: Bundle) -> ArkitMap:
     by_name = _by_name(bundle.rig_name, bundle.subject.expression_names)
     if by_name is not None:
         return by_name
+    if bundle.rig_name.startswith("flame"):
+        from cap4d.drive.arkit_flame import arkit_on_flame  # which knows this file's names
+
+        return arkit_on_flame(bundle)
     raise ArgumentError(
         f"arkit: expected an avatar on a rig with ARKit's expressions or on FLAME, got {bundle.rig_name}"
     )

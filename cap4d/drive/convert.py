@@ -76,9 +76,10 @@ class Converter:
         return self._frame(packet, expr, turns)
 
     def neutral(self, t: float = 0.0) -> Frame:
-        """The face at rest."""
+        """The face at rest: the rig's neutral, but its lips closed where a FLAME's are not."""
         zeros = np.zeros(3, np.float32)
-        return Frame(t, self._bundle.rig_name, np.zeros(len(self._names), np.float32), zeros, zeros, zeros)
+        expr, _, jaw_rot = self._at_rest()
+        return Frame(t, self._bundle.rig_name, expr, zeros, zeros, jaw_rot)
 
     def _frame(self, packet: Packet, expr: np.ndarray, turns: dict[str, np.ndarray]) -> Frame:
         for name in TURNS:
@@ -143,6 +144,13 @@ class Converter:
         if isinstance(self._arkit, str):
             raise Rejected(Cause.RIG, self._arkit)
         return self._arkit
+
+    def _at_rest(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        try:
+            arkit = self._arkit_map()
+        except Rejected:
+            return np.zeros(len(self._names), np.float32), np.zeros(3, np.float32), np.zeros(3, np.float32)
+        return arkit(np.zeros(arkit.expr.shape[1], np.float32))
 
     def _vertex_map(self) -> Retargeter:
         if self._retargeter is None:

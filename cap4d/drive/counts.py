@@ -27,16 +27,11 @@ class Counts:
         with self._lock:
             self.received += 1
 
-    def reject(self, cause: Cause, *, received: bool = False, times: int = 1) -> bool:
-        """A frame is refused; one that was `received` already is not counted again.
-
-        Returns:
-            Whether this is the first for that cause.
-        """
+    def reject(self, cause: Cause, *, received: bool = False, times: int = 1) -> None:
+        """A frame is refused, or so many; one that was `received` already is not counted again."""
         with self._lock:
             self.received += 0 if received else times
             self.rejected[cause] += times
-            return self.rejected[cause] == times
 
     def by_cause(self) -> dict[str, int]:
         """`{"syntax": 3, ...}`, causes that came up, in the order of `Cause`."""

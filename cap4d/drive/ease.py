@@ -1,4 +1,4 @@
-"""What is shown where a stream has a gap: it holds, then eases to the neutral face; it comes back smoothly."""
+"""What is shown where a stream has a gap: it holds, then eases to the neutral face; it returns smoothly."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Ease:
 
     def _flow(self, now: float) -> None:
         if self.state != "playing" and (self.state == "waiting" or self.dry > HICCUP):
-            self._fade_time = RETURN if self.state == "waiting" else min(self.dry, RETURN)
+            self._fade_time = RETURN if self.state == "waiting" else min(2 * self.dry, RETURN)
             self._start, self._fade_end = self._shown, now + self._fade_time
         self.state, self.dry, self._stopped = "playing", 0.0, None
 

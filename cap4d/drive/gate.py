@@ -1,4 +1,4 @@
-"""What stands between the lines that senders send and the sink: one sender rules, and none may flood."""
+"""What stands between senders and the sink: one sender rules, and none may flood."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ MAX_SENDERS = 64  # whose budgets are remembered
 class Gate:
     """Decides about each line. Not for two threads at once.
 
-    The first sender of a frame that is taken rules, until it leaves or is silent for a second; lines of others
-    are refused unread. So is what is more than `MAX_RATE` and `MAX_BYTES`, which bounds the work.
+    The first sender of a frame that is taken rules, until it leaves or is silent for a second; lines of
+    others are refused unread. So is what is more than `MAX_RATE` and `MAX_BYTES`, which bounds the work.
 
     Args:
         sink: Gets the frames, and the causes of what is refused.

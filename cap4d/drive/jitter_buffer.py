@@ -1,15 +1,15 @@
 """Frames as they arrive -> frames as they are due: the buffer between a network and a display.
 
-It plays the stream's own clock, `transit.Transit.target` behind the frames' arrival. When the depth has to change
-it plays up to a tenth faster or slower, so that no moment is jumped over or seen twice; while nothing moves on
-screen anyway, because frames are missing, it waits for as long as it takes at once. Memory is bounded:
-`MAX_FRAMES` frames, each kept for a second after it was due, to tell a duplicate from a late one.
+It plays the stream's own clock, `transit.Transit.target` behind the frames' arrival. When the depth has to
+change it plays up to a tenth faster or slower, so that no moment is jumped over or seen twice; while nothing
+moves on screen anyway, because frames are missing, it waits for as long as it takes at once. Memory is
+bounded: `MAX_FRAMES` frames, each kept for a second after it was due, to tell a duplicate from a late one.
 """
 
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,10 +23,13 @@ from cap4d.drive.transit import Transit
 SLEW = 0.1  # of the stream's speed
 MAX_FRAMES = 1024
 KEPT = 1.0  # s
+STAND = 0.05  # s
 BRIDGE = 0.25  # s between frames up to which they are interpolated
 NEW_CLOCK, NEW_CLOCK_TIME = 4, 0.05  # frames, and s of them, that agree on a jump of the clock
 AGREE = 0.1  # s
 MAX_DOUBTED = 64
+NOISE = 0.05  # of the way from picture to picture: less is no turn
+LOOK_BACK = 8  # frames in which a weight that stands still may have come to do so
 NOWHERE = float("-inf")
 
 
@@ -73,7 +76,9 @@ class JitterBuffer:
         self._doubted: list[_Entry] = []  # perhaps of another clock; as they came
         self._offset = 0.0  # s: moment t is due at t + offset
         self._position = NOWHERE  # the moment on screen
+        self._expr: np.ndarray | None = None  # and its weights
         self._now = NOWHERE
+        self._stood = 0.0  # s for which the clock was stopped in this gap
         self._dry = True
 
     @property
@@ -92,11 +97,11 @@ class JitterBuffer:
         if self.transit.is_stale(arrival):
             self._settle()
             self._restart([entry])
-        elif self._is_known(entry.t):
-            self._refuse(Cause.DUPLICATE)
         elif self.transit.fits(entry.t, arrival):
             self._settle()
             self._insert(entry)
+        elif any(other.t == entry.t for other in self._doubted):
+            self._refuse(Cause.DUPLICATE)
         else:
             self._doubt(entry)
 
@@ -115,7 +120,8 @@ class JitterBuffer:
         self._show([before, after] if mixed else [before])
         self._drop(self._entries[i] for i in passed)
         self._dry = not mixed and before.t < due
-        self._position = before.t if self._dry else due
+        self._stand(due - before.t if self._dry else 0.0)
+        self._position, self._expr = before.t if self._dry else due, moment.frame.expr
         self._forget(self._position - KEPT)
         return replace(moment, flows=not self._dry)
 
@@ -127,30 +133,56 @@ class JitterBuffer:
         shorter = float("inf") if self._position == NOWHERE else SLEW * elapsed
         self._offset += min(max(self.transit.target - self._offset, -shorter), longer)
 
+    def _stand(self, gone: float) -> None:
+        """Stops the stream's clock for a frame that is missing: no more than for `STAND` s a gap.
+
+        It would otherwise jump when the next frame comes; so it catches up by the slew.
+        """
+        step = min(gone, STAND - self._stood)
+        self._offset += step
+        self._stood = self._stood + step if gone else 0.0
+
     def _with_turns(self, frame: Frame, passed: range) -> Frame:
         """Puts the turning points that lie between the last picture and this one into this one.
 
         A blink is a few frames long: a display halfway between two of them, or one that shows every second,
         would never show the eye closed. So a weight that turned round at a frame since the last picture is
-        shown as it was there; the same keeps the moment in which lips touch.
+        shown as it was there, at the turn furthest from the last picture; the same keeps the moment in which
+        lips touch. A turn that the way from picture to picture dwarfs is noise, and left out.
         """
-        expr, furthest = frame.expr, np.zeros_like(frame.expr)
-        for k in range(max(passed.start, 1), min(passed.stop, len(self._entries) - 1)):
-            left, here, right = (entry.frame.expr for entry in self._entries[k - 1 : k + 2])
-            rise, fall, far = here - left, right - here, np.abs(here - frame.expr)
-            turned = (rise * fall <= 0) & (rise != fall) & (far > furthest)
-            if turned.any():
-                expr, furthest = np.where(turned, here, expr), np.where(turned, far, furthest)
+        last, now = self._expr, frame.expr
+        if last is None or not passed:
+            return frame
+        expr, furthest = now, NOISE * np.abs(now - last)
+        for k, here in self._turns(passed):
+            far = np.abs(here - last)
+            at_turn = ~np.isnan(here) & (np.minimum(far, np.abs(here - now)) > 0) & (far > furthest)
+            if at_turn.any():
+                expr, furthest = np.where(at_turn, here, expr), np.where(at_turn, far, furthest)
                 self._show([self._entries[k]])
         return replace(frame, expr=expr)
 
+    def _turns(self, passed: range) -> Iterator[tuple[int, np.ndarray]]:
+        """Frames at which weights turn round: (index, weights, with nan for those that go on)."""
+        first = max(passed.start - LOOK_BACK, 0)
+        values = np.stack([entry.frame.expr for entry in self._entries[first : passed.stop + 1]])
+        steps = np.sign(np.diff(values, axis=0))
+        course = np.zeros_like(values[0])  # the last way a weight went; it may have stood since
+        for at, step in enumerate(steps, first):
+            if at >= passed.start:
+                yield at, np.where(course * step < 0, values[at - first], np.float32(np.nan))
+            course = np.where(step != 0, step, course)
+
     def _insert(self, entry: _Entry) -> None:
         """Puts a frame of this clock in its place, if its moment is still to come."""
+        at = self._after(entry.t)
+        if at and self._entries[at - 1].t == entry.t:
+            return self._refuse(Cause.DUPLICATE)
         self.transit.add(entry.t, entry.arrival)
         if entry.t <= self._position:
             return self._refuse(Cause.LATE)
         self.overdue += entry.t < entry.arrival - self._offset and self._position > NOWHERE
-        self._entries.insert(self._after(entry.t), entry)
+        self._entries.insert(at, entry)
         if len(self._entries) > MAX_FRAMES:
             self._drop(self._entries[:1])
             del self._entries[0]
@@ -179,15 +211,11 @@ class JitterBuffer:
         """Takes up another clock, of which these are the first frames."""
         self._drop(self._entries)
         self._entries, self._doubted = sorted(entries, key=lambda entry: entry.t), []
-        self._position, self._dry = NOWHERE, True
+        self._position, self._expr, self._dry = NOWHERE, None, True
         self.clocks += 1
         self.transit.clear()
         for entry in entries:
             self.transit.add(entry.t, entry.arrival)
-
-    def _is_known(self, t: float) -> bool:
-        at = self._after(t)
-        return (at > 0 and self._entries[at - 1].t == t) or any(entry.t == t for entry in self._doubted)
 
     def _after(self, t: float) -> int:
         """Index of the first frame later than `t`."""

@@ -1,4 +1,4 @@
-"""A source of frames that come by themselves, played on the display's clock: what a window asks for its face."""
+"""Frames that come by themselves, played on the display's clock: what a window asks for its face."""
 
 from __future__ import annotations
 
@@ -95,7 +95,10 @@ class LiveStream:
     @property
     def ended(self) -> bool:
         """Whether nothing can come any more, and what came was played."""
-        return self._thread is not None and not self._thread.is_alive() and self.state == "waiting"
+        if self._thread is None or self._thread.is_alive() or self.state != "waiting":
+            return False
+        with self._lock:
+            return not self._buffer.waiting
 
     def frame(self, now: float) -> Frame:
         """The face to show at `now` s."""
@@ -155,15 +158,17 @@ class LiveStream:
 
     def packet(self, packet: Packet, arrival: float) -> bool:
         """As a sink: takes a frame in."""
-        self._counts.receive()
         try:
             frame = self._sound(self._convert(packet))
         except Rejected as error:
-            return self._refuse(error.cause, error.detail)
+            self.rejected(error.cause, error.detail)
+            return False
         except Exception:
             log.debug("%s: no frame could be made of a packet", self.address, exc_info=True)
-            return self._refuse(Cause.INTERNAL, "no frame could be made of it")
+            self.rejected(Cause.INTERNAL, "no frame could be made of it")
+            return False
         with self._lock:
+            self._counts.receive()
             self._last_arrival = max(self._last_arrival, arrival)
             self._buffer.push(frame, arrival)
         return True
@@ -172,11 +177,6 @@ class LiveStream:
         """As a sink: a frame was refused before it got here, or so many."""
         self._counts.reject(cause, times=times)
         self._tell(cause, detail)
-
-    def _refuse(self, cause: Cause, detail: str) -> bool:
-        self._counts.reject(cause, received=True)
-        self._tell(cause, detail)
-        return False
 
     def _tell(self, cause: Cause, detail: str) -> None:
         """One line for the first frame of each cause; the counts say the rest."""

@@ -35,10 +35,10 @@ def open_live(
     """Opens a live source for an avatar; it receives while the stream is used as a context.
 
     Args:
-        spec: `-`: lines of JSON on standard input; `tcp://HOST:PORT`, `udp://HOST:PORT`, `ws://HOST:PORT`: the
-            same from senders who connect here; `livelink://HOST:PORT`, `vmc://HOST:PORT`: phones' and trackers'
-            datagrams; `webcam://0`. Without HOST it is this computer alone; with another than that, senders
-            must bear `?token=X`, or, where they cannot, come `?from=ADDRESS`.
+        spec: `-`: lines of JSON on standard input; `tcp://HOST:PORT`, `udp://HOST:PORT`, `ws://HOST:PORT`:
+            the same from senders who connect here; `livelink://HOST:PORT`, `vmc://HOST:PORT`: datagrams of
+            phones and trackers; `webcam://0`. Without HOST this computer alone can send; with another address
+            than its own, senders must bear `?token=X`, or, where they cannot, come `?from=ADDRESS`.
         bundle: The avatar.
         template: Neutral vertices of senders of vertices; see `open_source`.
         fps: None: live frames bear stamps.
@@ -52,7 +52,8 @@ def open_live(
         raise ArgumentError(f"fps: expected none for a live source, whose frames bear stamps, got {fps:g}")
     if template is not None and spec != "-" and _scheme(spec) not in WIRE:
         raise ArgumentError(f"template: goes with senders of vertices (-, tcp, udp, ws), got {spec}")
-    return LiveStream(_receiver(spec, bundle), Converter(bundle, template=template), fillers)
+    convert = Converter(bundle, template=template)
+    return LiveStream(_receiver(spec, bundle), convert, fillers)
 
 
 @dataclass(frozen=True)

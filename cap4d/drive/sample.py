@@ -28,9 +28,7 @@ def sample(clip: Clip, t: float) -> Frame:
     values = {}
     for name in ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra"):
         value = getattr(clip, name)
-        values[name] = (
-            None if value is None else between(value[here], value[there], blend, cut=name in TURNS)
-        )
+        values[name] = None if value is None else between(value[here], value[there], blend, cut=name in TURNS)
     return Frame(t, clip.rig_name, **values)
 
 

@@ -7,11 +7,12 @@ import select
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 
 from cap4d.drive.gate import Gate
 from cap4d.drive.pace import Pace
-from cap4d.drive.packet import Sink
+from cap4d.drive.packet import Cause, Sink
 from cap4d.drive.wire import LineSplitter
 
 READ = 1 << 16  # bytes at once
@@ -35,18 +36,16 @@ class StandardInputReceiver:
         """See `packet.Receiver`."""
         gate, pace, splitter = Gate(sink), Pace(), LineSplitter()
         for data in self._chunks(stop):
-            lines = list(splitter.feed(data))
-            flooded = False
-            for left, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
+            lines = deque(splitter.feed(data))
+            while lines and not stop.is_set():
                 now = self._clock()
-                t = gate.line(self, line, now)
-                flooded = flooded or gate.flooded
-                if t is not None and (lead := pace.lead(t, now)) and (left or self._has_more(0.0)):
+                t = gate.line(self, lines.popleft(), now)
+                if t is not None and (lead := pace.lead(t, now)) and (lines or self._has_more(0.0)):
                     stop.wait(lead)
-                if stop.is_set():
-                    return
-            if flooded:
-                stop.wait(FLOODED)
+                elif gate.flooded:
+                    sink.rejected(Cause.FLOOD, times=len(lines))
+                    lines.clear()
+                    stop.wait(FLOODED)
 
     def _chunks(self, stop: threading.Event) -> Iterator[bytes]:
         while not stop.is_set():
@@ -57,5 +56,5 @@ class StandardInputReceiver:
                     return
 
     def _has_more(self, timeout: float) -> bool:
-        """Whether reading would not wait. Windows cannot tell for pipes: there it is read in a thread that waits."""
+        """Whether reading would not wait. Windows cannot tell: there the thread waits."""
         return os.name != "posix" or bool(select.select([self._file], [], [], timeout)[0])

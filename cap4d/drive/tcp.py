@@ -23,7 +23,7 @@ READ = 1 << 16  # bytes at once
 GREETING = 5.0  # s in which a connection has to bring its first frame
 IDLE = 60.0  # s without a line, after which a connection is taken for dead
 POLL = 0.1  # s
-FLOODED = 20e-3  # s that a connection is not read after lines of it were refused as a flood
+FLOODED = 20e-3  # s that a connection is not read after a flood, of which all that was read is dropped
 
 
 class TcpReceiver:
@@ -151,7 +151,6 @@ class _Server:
 
     def _listen_to(self, connection: _Connection, now: float) -> None:
         """Looks at the lines that are there, up to one that is ahead of its time."""
-        flooded = False
         while connection.lines and connection.until <= now:
             line = connection.lines.popleft()
             connection.greeted, connection.heard = True, now
@@ -163,9 +162,10 @@ class _Server:
             elif (t := self.gate.line(connection, line, now)) is not None:
                 lead = connection.pace.lead(t, now)
                 connection.until = now + lead if connection.lines else now
-            flooded = flooded or self.gate.flooded
-        if flooded:
-            connection.until = now + FLOODED
+            elif self.gate.flooded:
+                self.sink.rejected(Cause.FLOOD, times=len(connection.lines))
+                connection.lines.clear()
+                connection.until = now + FLOODED
 
     def _say(self, connection: _Connection, error: Rejected) -> None:
         """Tells the other side why, if it listens."""

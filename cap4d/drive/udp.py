@@ -1,4 +1,4 @@
-"""Frames over UDP: a line of JSON, or several, a datagram (`wire`); one of 5,023 vertices is too large for it."""
+"""Frames over UDP: a line of JSON a datagram, or several (`wire`); 5,023 vertices are too many for one."""
 
 from __future__ import annotations
 

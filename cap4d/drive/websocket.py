@@ -1,7 +1,7 @@
 """Frames over WebSocket: the player is the server, a sender's message is a line of JSON (`wire`), or several.
 
-A web page may drive the player of the computer it is looked at on only with the token, or when it comes from that
-computer itself: browsers name the page in `Origin`.
+A web page may drive the player of the computer it is looked at on only with the token, or when it comes
+from that computer itself: browsers name the page in `Origin`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import logging
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import TYPE_CHECKING
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 POLL = 0.1  # s
+AHEAD = 0.25  # s; whether more waits to be read is not known here, so what is less may be jitter
 LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 TRY_AGAIN_LATER, POLICY = 1013, 1008  # close codes, RFC 6455 7.4.1 and IANA's registry
 
@@ -52,10 +54,11 @@ class WebSocketReceiver:
         token: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        import websockets.asyncio.server  # noqa: F401  its absence is told before anything starts
+        import websockets  # noqa: F401  its absence is told before anything starts
 
         self.token, self._clock = token, clock
         self._listener = listen(host, port, socket.SOCK_STREAM, "ws")
+        self._listener.listen(MAX_CONNECTIONS)
         self.address = f"ws://{authority(self._listener)}"
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
@@ -129,14 +132,20 @@ class _Visitors:
                 self.sink.rejected(Cause.SENDER, "a connection is silent")
                 return await connection.close(POLICY, "silent")
             patience = IDLE
-            for line in message.split(b"\n"):
+            if not self.gate.rules(connection, self.clock()):
+                await asyncio.sleep(POLL)  # for one who rules to have hung up just now
+            lines = deque(line for line in message.split(b"\n") if line.strip())
+            while lines:
                 now = self.clock()
-                if not line.strip():
-                    continue
-                t = self.gate.line(connection, line, now)
+                t = self.gate.line(connection, lines.popleft(), now)
                 if not self.gate.rules(connection, now):
                     return await connection.close(TRY_AGAIN_LATER, "another one sends already")
-                await asyncio.sleep(FLOODED if self.gate.flooded else 0 if t is None else pace.lead(t, now))
+                if self.gate.flooded:
+                    self.sink.rejected(Cause.FLOOD, times=len(lines))
+                    lines.clear()
+                    await asyncio.sleep(FLOODED)
+                elif t is not None and (lead := pace.lead(t, now) - AHEAD) > 0:
+                    await asyncio.sleep(lead)
 
 
 def _token(request: Request) -> str | None:

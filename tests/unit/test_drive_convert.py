@@ -173,7 +173,5 @@ def test_codetalker_frames_one_at_a_time(shared: Path) -> None:
         expr.append(convert(Packet(i / 30, vertices=frame)).expr)
         residual.append(convert.residual_mm)
     error, spread = np.sqrt(((np.array(expr) - truth["expr"]) ** 2).mean()), truth["expr"].std()
-    print(
-        f"expression error {error:.5f} rms of a spread of {spread:.3f}; residual {max(residual):.5f} mm"
-    )
+    print(f"expression error {error:.5f} rms of a spread of {spread:.3f}; residual {max(residual):.5f} mm")
     assert error < 0.003 * spread and max(residual) < 0.01

@@ -38,9 +38,7 @@ def frame(**changes: object) -> bytes:
 )
 def test_a_frame_comes_back_to_the_bit(kind) -> None:
     rng = np.random.default_rng(0)
-    values = {
-        k: v if isinstance(v, str) else rng.normal(size=v).astype(np.float32) for k, v in kind.items()
-    }
+    values = {k: v if isinstance(v, str) else rng.normal(size=v).astype(np.float32) for k, v in kind.items()}
     turns = {
         name: rng.normal(size=3).astype(np.float32) for name in ("eye_rot", "neck_rot", "jaw_rot", "rot")
     }
@@ -139,7 +137,10 @@ def test_a_token_is_asked_for() -> None:
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7, 1000])
 def test_lines_come_out_whole_however_they_come_in(chunk) -> None:
-    data, splitter = b"one\n\n  \ntwo\r\n" + b"x" * 21 + b"\nthree\n" + b"y" * 20 + b"\nrest", LineSplitter(20)
+    data, splitter = (
+        b"one\n\n  \ntwo\r\n" + b"x" * 21 + b"\nthree\n" + b"y" * 20 + b"\nrest",
+        LineSplitter(20),
+    )
     parts = [data[i : i + chunk] for i in range(0, len(data), chunk)]
     lines = [line for part in parts for line in splitter.feed(part)]
     assert lines == [b"one", b"two\r", None, b"three", b"y" * 20]

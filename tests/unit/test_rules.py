@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 CORE_RING = ("rig", "bundle", "player", "drive")
 PLAYER_MODULES = {"numpy", "onnxruntime", "safetensors", "moderngl", "glfw", "imgui_bundle", "av"}
-LIVE_MODULES = {"miniaudio"}  # the extra `live`: imported where they are used
+LIVE_MODULES = {"miniaudio", "websockets"}  # the extra `live`: imported where they are used
 FILE_ROOMS = ("rig", "bundle", "player", "drive", "capture", "track", "export", "avatar", "synth")
 
 
