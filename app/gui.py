@@ -167,7 +167,7 @@ class Gui:
         io = self._io()
         width, height = max(size[0], 1), max(size[1], 1)
         io.display_size = imgui.ImVec2(width, height)
-        io.display_framebuffer_scale = imgui.ImVec2(pixels[0] / width, pixels[1] / height)
+        io.display_framebuffer_scale = imgui.ImVec2(max(pixels[0], 1) / width, max(pixels[1], 1) / height)
         io.delta_time = min(max(seconds, 1e-4), LONGEST_STEP)
         imgui.new_frame()
 

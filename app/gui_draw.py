@@ -24,6 +24,7 @@ class GuiDraw:
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
         self.textures: dict[int, moderngl.Texture] = {}
+        self._used = -1  # the texture in use
         self.program = build_program(ctx, "panel")
         self.vertices = ctx.buffer(reserve=1 << 18, dynamic=True)
         self.indices = ctx.buffer(reserve=1 << 16, dynamic=True)
@@ -39,6 +40,7 @@ class GuiDraw:
         self.ctx.enable_only(moderngl.BLEND)
         self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         self.program["display"] = *data.display_pos, *data.display_size
+        self._used = -1
         for commands in data.cmd_lists:
             self._upload(commands)
             for command in commands.cmd_buffer:
@@ -55,7 +57,9 @@ class GuiDraw:
         if not (scissor[2] and scissor[3] and command.elem_count):
             return
         self.ctx.scissor = scissor
-        self.textures[command.get_tex_id()].use(0)
+        if command.get_tex_id() != self._used:
+            self._used = command.get_tex_id()
+            self.textures[self._used].use(0)
         self.array.render(moderngl.TRIANGLES, vertices=command.elem_count, first=command.idx_offset)
 
     def _update(self, texture: imgui.ImTextureData) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +22,6 @@ from cap4d.player.offline import Draw, Output, draw_on_cpu, pipeline_threads, re
 
 log = logging.getLogger(__name__)
 
-PICTURE = 512, 512  # px, where no size is asked for
-
 
 def play_headless(path: Path, options: Options) -> None:
     """Renders the avatar at `path` to `options.out`, or to a video of its name in the current folder.
@@ -33,7 +30,6 @@ def play_headless(path: Path, options: Options) -> None:
         ArgumentError, DataError: See `cap4d.player.offline.render_to`; `--pipeline` on another backend.
         GlUnavailableError: `--backend gl` without OpenGL 4.1.
     """
-    options = replace(options, size=options.size or PICTURE)
     threads = pipeline_threads() if options.pipeline else 0
     avatar = Avatar.load(path, deformer=options.deformer, threads=threads, deformer_budget_ms=math.inf)
     if is_live(options.drive):
@@ -43,7 +39,8 @@ def play_headless(path: Path, options: Options) -> None:
     if options.pipeline and backend != "cpu":
         raise ArgumentError(f"pipeline: expected the cpu backend, got {backend}")
     out = options.out or f"{path.stem}.mp4"
-    output = Output(out, frames=options.frames, size=options.size, stats=options.stats, audio=options.audio)
+    size = options.picture_size
+    output = Output(out, frames=options.frames, size=size, stats=options.stats, audio=options.audio)
     pipelined = options.pipeline
     stats = render_to(avatar, clip, options.camera, output, draw=draw, backend=backend, pipelined=pipelined)
     log.info("%s: %d frames, %.1f fps (%s)", out, stats["frames"], stats["fps"], backend)

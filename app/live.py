@@ -136,6 +136,9 @@ class LivePlayer:
             return False
         layout, start = self._layout(), time.perf_counter()
         is_new = self._draw_picture(layout)
+        if viewer.has_news:
+            viewer.has_news = False
+            self.gui.touch()
         if not (is_new or self.gui.is_moving or viewer.toasts.next_change(viewer.now) <= viewer.now):
             return False
         self._show(layout, is_new)

@@ -28,6 +28,7 @@ DRIVE_HELP = (
     "fit.npz or vertices .npy; or live: - (lines of JSON), tcp://, udp:// or ws://HOST:PORT, livelink://, "
     "vmc://, webcam://0 (default: the avatar's idle clip)"
 )
+PICTURE = 512, 512  # px, where no size is asked for
 DEFORMERS = ("auto", "full", "fp16", "int8", "linear", "off")
 FPS_HELP = "frames per second of the source, whatever it says itself (live, headless: of the file)"
 DEFORMER_HELP = (
@@ -57,6 +58,11 @@ class Options:
     stats: Path | None
     serve: str | None
     token: str | None
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """(width, height) px of a picture without a window."""
+        return self.size or PICTURE
 
 
 def parse_options(argv: Sequence[str] | None = None) -> Options:

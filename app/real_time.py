@@ -20,7 +20,7 @@ from cap4d.player.video import VideoWriter, check_file, check_output
 
 log = logging.getLogger(__name__)
 
-DEFAULT_FPS, DEFAULT_SIZE = 30.0, (512, 512)
+DEFAULT_FPS = 30.0
 
 
 def record_live(
@@ -38,8 +38,9 @@ def record_live(
     fps = options.fps or DEFAULT_FPS
     if options.stats is not None:
         check_file(options.stats, "stats")
-    size, several = options.size or DEFAULT_SIZE, options.frames or 2
+    size = options.picture_size
     cameras = camera_path(options.camera, avatar.camera, head_centre(avatar), fps=fps, size=size)
+    several = options.frames or 2
     check_output(Path(out), fps=fps, frames=several, size=size)
     player = _Player(avatar, stream, cameras, draw)
     player.draw(0)  # loads what the others find loaded

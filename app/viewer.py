@@ -83,6 +83,7 @@ class Viewer:
         self.display_hz = 60.0
         self.recording_since: float | None = None
         self.asked: deque[Action] = deque()
+        self.has_news = False  # a message that was not drawn yet
         self.is_settling = False  # nothing should be drawn: the deformers are being measured
         self.random = np.random.default_rng()
         self._take_avatar(loaded)
@@ -125,7 +126,8 @@ class Viewer:
 
     def settle(self) -> None:
         """Finds the deformer that suits this machine, if that is still to be done."""
-        if not self.loaded.is_settled and not self.is_settling:
+        if not self.loaded.is_settled:
+            self.loaded = replace(self.loaded, is_settled=True)  # once: a network that fails is said and left
             self.is_settling = True
             self._change_deformer(self.wanted_deformer, "Choosing a deformer")
 
@@ -208,10 +210,12 @@ class Viewer:
     def fail(self, error: BaseException) -> None:
         """Shows an error; nothing ends."""
         self.toasts.fail(error, self.now)
+        self.has_news = True
 
     def say(self, text: str) -> None:
         """Shows a message."""
         self.toasts.say(text, self.now)
+        self.has_news = True
 
     def _change_deformer(self, tier: str, label: str) -> None:
         loaded = self.loaded

@@ -49,8 +49,9 @@ def demo_avatar_path() -> Path:
 
 
 def remembered_demo() -> Path | None:
-    """The demo's avatar, if it is known which one this code makes: building the head to find out takes most
-    of a second.
+    """The demo's avatar, if it is known which one this code makes.
+
+    To find out otherwise takes a head that is built, most of a second.
     """
     try:
         code, name = json.loads((cache_folder() / DEMO_RECORD).read_text("utf-8")[:1000])

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from cap4d.app.gui import SETTLE
 from cap4d.app.live import LivePlayer, open_viewer
 from cap4d.app.options import parse_options
 from cap4d.app.window import Window
@@ -55,6 +56,9 @@ def xdotool(player: LivePlayer, *words: object) -> None:
     pump(player, lambda: process.poll() is not None)
     assert process.returncode == 0, words
     pump_for(player, 0.1)
+    for _ in range(2 * SETTLE):  # a busy machine may have drawn nothing of it yet
+        player.window.poll()
+        player.step()
 
 
 def drag(player: LivePlayer, start: tuple[float, float], end: tuple[float, float], button: int = 1) -> None:

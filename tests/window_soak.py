@@ -33,8 +33,12 @@ def write_droppings(folder: Path, avatar: Path) -> list[Path]:
     return [avatar, *(folder / name for name in names)]
 
 
-def soak_round(player: LivePlayer, droppings: list[Path], folder: Path) -> None:
-    """One round: every panel, menu and dialog opened and closed, every size, every drop while it records."""
+def soak_round(player: LivePlayer, droppings: list[Path], folder: Path) -> set[str]:
+    """One round: every panel, menu and dialog opened and closed, every size, every drop while it records.
+
+    Returns:
+        The errors that were said of what was dropped.
+    """
     player.taking.folder = folder
     viewer = player.viewer
     viewer.act(Action.RECORD)
@@ -61,9 +65,11 @@ def soak_round(player: LivePlayer, droppings: list[Path], folder: Path) -> None:
     for size in SIZES:
         glfw.set_window_size(player.window.handle, *size)
         pump_for(player, 0.2)
+    said: set[str] = set()
     for path in droppings:
         player.input.dropped([path])
         pump(player, lambda: viewer.jobs.label is None, 60)
+        said |= errors_said(player)
     viewer.act(Action.RANDOM_FACE)
     viewer.act(Action.NEXT_DEFORMER)
     viewer.act(Action.SCREENSHOT)
@@ -74,12 +80,13 @@ def soak_round(player: LivePlayer, droppings: list[Path], folder: Path) -> None:
     viewer.set_sound(None)
     viewer.overlays = frozenset()
     viewer.background = (1.0, 1.0, 1.0)
+    return said
 
 
-def errors_said(player: LivePlayer) -> list[str]:
+def errors_said(player: LivePlayer) -> set[str]:
     """The errors on screen."""
     viewer = player.viewer
-    return [t.text for t in viewer.toasts.current(viewer.now) if t.tone is Tone.ERROR]
+    return {t.text for t in viewer.toasts.current(viewer.now) if t.tone is Tone.ERROR}
 
 
 def resident_mb() -> float:

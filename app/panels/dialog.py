@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cap4d.app.layout import Rect
-from cap4d.app.panels.widgets import ImVec2, quiet, tip
+from cap4d.app.panels.widgets import ImVec2, choice, quiet, tip, units
 from cap4d.app.shortcuts import Action
 from cap4d.app.viewer import Viewer
 from imgui_bundle import imgui
@@ -15,9 +15,19 @@ HINTS = {
     Action.OPEN: "path of a .cap4d, .npz or .npy file",
     Action.DRIVE: "tcp://127.0.0.1:9000",
 }
+ADDRESSES = {
+    "tcp://127.0.0.1:9000": "lines of JSON",
+    "ws://127.0.0.1:9001": "lines of JSON, from a web page",
+    "livelink://127.0.0.1:11111": "Live Link Face",
+    "vmc://127.0.0.1:39539": "VMC, face trackers",
+    "webcam://0": "a camera",
+}
 WIDTH = 460.0  # units of design
 FLAGS = (
-    imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_move
+    imgui.WindowFlags_.always_auto_resize
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_collapse
+    | imgui.WindowFlags_.no_move
 )
 
 
@@ -41,6 +51,8 @@ class Dialog:
             self._draw_field(viewer, asks, appearing)
             if asks is Action.OPEN:
                 _draw_recent(viewer)
+            else:
+                self._draw_examples()
         imgui.end()
         if not stays:
             viewer.dialog = None
@@ -49,7 +61,7 @@ class Dialog:
         if appearing:
             self.text = ""
             imgui.set_keyboard_focus_here()
-        imgui.set_next_item_width(WIDTH * imgui.get_style().font_scale_dpi)
+        imgui.set_next_item_width(units(WIDTH))
         entered, self.text = imgui.input_text_with_hint(
             "##text", HINTS[asks], self.text, imgui.InputTextFlags_.enter_returns_true
         )
@@ -63,6 +75,13 @@ class Dialog:
                 viewer.open(Path(text).expanduser())
             else:
                 viewer.drive(text)
+
+    def _draw_examples(self) -> None:
+        imgui.spacing()
+        quiet("Addresses")
+        for address, text in ADDRESSES.items():
+            if choice(address, self.text == address, text):
+                self.text = address
 
 
 def _draw_recent(viewer: Viewer) -> None:

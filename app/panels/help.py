@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cap4d.app.layout import Rect
-from cap4d.app.panels.widgets import ImVec2, quiet
+from cap4d.app.panels.widgets import ImVec2, quiet, units
 from cap4d.app.shortcuts import POINTER, SHORTCUTS
 from cap4d.app.theme import ACCENT
 from cap4d.app.viewer import Viewer
@@ -29,14 +29,14 @@ class HelpPanel:
         if opened:
             groups = [(title, [(s.shown, s.text) for s in keys]) for title, keys in SHORTCUTS.items()]
             _draw_column([groups[0], groups[3]])
-            imgui.same_line(0, 28)
+            imgui.same_line(0, units(28))
             _draw_column([groups[1], groups[2], ("Pointer", list(POINTER))])
         imgui.end()
 
 
 def _draw_column(groups: list[tuple[str, list[tuple[str, str]]]]) -> None:
     """Lines of a key and what it does, in groups; the texts start below each other."""
-    indent = max(imgui.calc_text_size(key).x for _, rows in groups for key, _ in rows) + 14
+    indent = max(imgui.calc_text_size(key).x for _, rows in groups for key, _ in rows) + units(14)
     imgui.begin_group()
     for title, rows in groups:
         imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*ACCENT))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from cap4d.app.layout import MENU
 from cap4d.app.panels.look import error_text
-from cap4d.app.panels.widgets import ImVec2, quiet
+from cap4d.app.panels.widgets import ImVec2, quiet, units
 from cap4d.app.shortcuts import Action, shown_key
 from cap4d.app.viewer import Viewer
 from imgui_bundle import imgui
@@ -13,7 +14,10 @@ class Menu:
     """File, View, Help."""
 
     def draw(self, viewer: Viewer) -> None:
-        imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(8, 7))
+        imgui.push_style_var(
+            imgui.StyleVar_.frame_padding,
+            ImVec2(units(8), units(MENU) / 2 - imgui.get_text_line_height() / 2),
+        )
         if imgui.begin_main_menu_bar():
             if imgui.begin_menu("File"):
                 _draw_file(viewer)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cap4d.app.layout import Rect
-from cap4d.app.panels.widgets import ImVec2, ImVec4, bare_button, quiet, wrapped
+from cap4d.app.panels.widgets import ImVec2, ImVec4, bare_button, quiet, units, wrapped
 from cap4d.app.theme import BAD, QUIET, TEXT, Icon, icon
 from cap4d.app.toasts import Toast, Tone
 from cap4d.app.viewer import Viewer
@@ -35,12 +35,12 @@ class Notes:
 
 def _draw_toast(viewer: Viewer, toast: Toast, number: int, left: float, bottom: float) -> float:
     """Returns its height."""
-    width = WIDTH * imgui.get_style().font_scale_dpi
+    width = units(WIDTH)
     imgui.set_next_window_pos(ImVec2(left, bottom), imgui.Cond_.always, ImVec2(0, 1))
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(width, 400))
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(width, units(400)))
     imgui.push_style_var(imgui.StyleVar_.alpha, max(toast.opacity(viewer.now), 0.02))
     imgui.begin(f"note {number}", None, FLAGS)
-    imgui.push_text_wrap_pos(width - 24)
+    imgui.push_text_wrap_pos(width - units(24))
     color = BAD if toast.tone is Tone.ERROR else TEXT
     imgui.push_style_color(imgui.Col_.text, ImVec4(*color))
     imgui.text_unformatted(toast.text if toast.count == 1 else f"{toast.text} ({toast.count} times)")
@@ -60,8 +60,8 @@ def _draw_welcome(viewer: Viewer, place: Rect) -> None:
     imgui.set_next_window_pos(at, imgui.Cond_.always, ImVec2(0.5, 1))
     imgui.set_next_window_bg_alpha(0.9)
     if imgui.begin("welcome", None, FLAGS)[0]:
-        fits = place.width - 4 * MARGIN * scale - 40
-        imgui.push_text_wrap_pos(max(fits, 120))
+        fits = place.width - 4 * MARGIN * scale - units(40)
+        imgui.push_text_wrap_pos(max(fits, units(120)))
         imgui.align_text_to_frame_padding()
         quiet(WELCOME) if imgui.calc_text_size(WELCOME).x < fits else wrapped(WELCOME, QUIET)
         imgui.pop_text_wrap_pos()

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from cap4d.app.panels.widgets import ImVec2, color32, pairs, quiet, section
+from cap4d.app.panels.widgets import ImVec2, color32, pairs, quiet, section, units
 from cap4d.app.theme import FIELD, PANEL, QUIET, Color
 from cap4d.app.timings import HISTORY, STAGES
 from cap4d.app.viewer import Viewer
@@ -83,8 +83,7 @@ def _shown(value: object) -> str:
 
 
 def _draw_graph(rows: np.ndarray) -> None:
-    scale = imgui.get_style().font_scale_dpi
-    size = ImVec2(imgui.get_content_region_avail().x, GRAPH_HEIGHT * scale)
+    size = ImVec2(imgui.get_content_region_avail().x, units(GRAPH_HEIGHT))
     at = imgui.get_cursor_screen_pos()
     imgui.dummy(size)
     draw, top = imgui.get_window_draw_list(), graph_top(rows)
@@ -119,9 +118,9 @@ def _draw_legend(numbers: Mapping[str, float]) -> None:
         for name, milliseconds in numbers.items():
             imgui.table_next_column()
             at, line = imgui.get_cursor_screen_pos(), imgui.get_text_line_height()
-            centre = ImVec2(at.x + 4, at.y + line / 2)
-            imgui.get_window_draw_list().add_circle_filled(centre, 4, PACKED[name])
-            imgui.dummy(ImVec2(8, line))
+            centre = ImVec2(at.x + units(4), at.y + line / 2)
+            imgui.get_window_draw_list().add_circle_filled(centre, units(4), PACKED[name])
+            imgui.dummy(ImVec2(units(8), line))
             imgui.same_line()
             quiet(name)
             imgui.same_line()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cap4d.app.layout import Rect
-from cap4d.app.panels.widgets import FIXED, ImVec2, bare_button, lit_button, quiet, tip
+from cap4d.app.panels.widgets import FIXED, ImVec2, bare_button, lit_button, quiet, tip, units
 from cap4d.app.playback import SPEEDS, ClipPlayback, Playback, StreamPlayback
 from cap4d.app.shortcuts import Action, shown_key
 from cap4d.app.theme import BAD, BAR, GOOD, HELD, QUIET, Color, Icon, icon
@@ -22,7 +22,7 @@ class Transport:
         imgui.set_next_window_size(ImVec2(place.width, place.height))
         imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*BAR))
         imgui.push_style_var(
-            imgui.StyleVar_.window_padding, ImVec2(10, (place.height - imgui.get_frame_height()) / 2)
+            imgui.StyleVar_.window_padding, ImVec2(units(10), (place.height - imgui.get_frame_height()) / 2)
         )
         if imgui.begin("transport", None, FIXED | imgui.WindowFlags_.no_scrollbar)[0]:
             if isinstance(viewer.playback, ClipPlayback):
@@ -49,7 +49,7 @@ def _action(viewer: Viewer, action: Action, symbol: str, text: str, *, color: Co
     if bare_button(f"{icon(symbol)}##{action.name}", size=_square(), color=color):
         viewer.act(action)
     tip(f"{text} ({shown_key(action)})")
-    imgui.same_line(0, 2)
+    imgui.same_line(0, units(2))
 
 
 def _draw_clip(viewer: Viewer, playback: ClipPlayback) -> None:
@@ -58,21 +58,21 @@ def _draw_clip(viewer: Viewer, playback: ClipPlayback) -> None:
     _action(viewer, Action.PLAY, symbol, text)
     _action(viewer, Action.NEXT, Icon.FORWARD, "One frame on")
     _draw_scrubber(viewer, playback)
-    imgui.same_line(0, 6)
+    imgui.same_line(0, units(6))
     if lit_button(f"{icon(Icon.REPEAT)}##loop", playback.loops, size=_square()):
         viewer.act(Action.LOOP)
     tip(f"Repeat ({shown_key(Action.LOOP)})")
-    imgui.same_line(0, 2)
+    imgui.same_line(0, units(2))
     _draw_speed(viewer, playback)
 
 
 def _draw_scrubber(viewer: Viewer, playback: ClipPlayback) -> None:
     length, position = playback.clip.duration, playback.position
     text = f"{clock_text(position)} / {clock_text(length)}"
-    right = 4 * _square()[0] + imgui.calc_text_size("0.25 x").x + 84
-    width = imgui.get_content_region_avail().x - right - imgui.calc_text_size(text).x - 12
-    if width > 40:
-        imgui.same_line(0, 8)
+    right = 4 * _square()[0] + imgui.calc_text_size("0.25 x").x + units(84)
+    width = imgui.get_content_region_avail().x - right - imgui.calc_text_size(text).x - units(12)
+    if width > units(40):
+        imgui.same_line(0, units(8))
         imgui.set_next_item_width(width)
         moved, wanted = imgui.slider_float("##scrub", position, 0.0, length, "", imgui.SliderFlags_.no_input)
         if moved:
@@ -84,7 +84,7 @@ def _draw_scrubber(viewer: Viewer, playback: ClipPlayback) -> None:
 
 
 def _draw_speed(viewer: Viewer, playback: ClipPlayback) -> None:
-    imgui.set_next_item_width(imgui.calc_text_size("0.25 x").x + 36)
+    imgui.set_next_item_width(imgui.calc_text_size("0.25 x").x + units(36))
     if imgui.begin_combo("##speed", f"{playback.speed:g} x"):
         for speed in SPEEDS:
             if imgui.selectable(f"{speed:g} x", speed == playback.speed)[0]:
@@ -100,9 +100,9 @@ def _draw_live(viewer: Viewer, playback: Playback) -> None:
     imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*color))
     imgui.text_unformatted(f"{icon(Icon.LIVE)}  {WORDS.get(state, state)}")
     imgui.pop_style_color()
-    imgui.same_line(0, 12)
+    imgui.same_line(0, units(12))
     quiet(playback.name)
-    imgui.same_line(0, 12)
+    imgui.same_line(0, units(12))
     if imgui.button("Stop listening"):
         viewer.act(Action.IDLE)
 
@@ -111,12 +111,12 @@ def _draw_cameras(viewer: Viewer) -> None:
     side = _square()[0]
     recording = viewer.recording_since is not None
     text = clock_text(viewer.now - viewer.recording_since) if recording else ""
-    width = 2 * side + 2 + (imgui.calc_text_size(text).x + 6 if recording else 0)
+    width = 2 * side + units(2) + (imgui.calc_text_size(text).x + units(6) if recording else 0)
     imgui.same_line(imgui.get_window_width() - width - imgui.get_style().window_padding.x)
     if recording:
         imgui.align_text_to_frame_padding()
         quiet(text)
-        imgui.same_line(0, 6)
+        imgui.same_line(0, units(6))
     _action(viewer, Action.SCREENSHOT, Icon.PHOTO, "Screenshot")
     words = "Stop recording" if recording else "Record"
     _action(viewer, Action.RECORD, Icon.STOP if recording else Icon.RECORD, words, color=BAD)

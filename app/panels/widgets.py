@@ -22,6 +22,11 @@ SLIDER = imgui.SliderFlags_.always_clamp | imgui.SliderFlags_.no_round_to_format
 HIDDEN_GRAB = (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active)
 
 
+def units(design: float) -> float:
+    """Window units of so many units of design."""
+    return design * imgui.get_style().font_scale_dpi
+
+
 @cache
 def color32(color: Color, opacity: float = 1.0) -> int:
     """A colour as draw lists take it."""
@@ -72,13 +77,14 @@ def _paint_bar(text: str, value: float, low: float, high: float, held: bool, num
         rounding = imgui.get_style().frame_rounding
         draw.add_rect_filled(ImVec2(left, least.y), ImVec2(right, most.y), color32(color, strength), rounding)
     pad = imgui.get_style().frame_padding
-    draw.push_clip_rect(least, most, True)
-    y = least.y + pad.y
+    y, right = least.y + pad.y, most.x - pad.x
     shown = signless_zero(number % value)
-    size = imgui.calc_text_size(shown)
-    draw.add_text(ImVec2(least.x + pad.x, y), color32(HELD if held else TEXT), text)
-    draw.add_text(ImVec2(most.x - pad.x - size.x, y), color32(HELD if held else QUIET), shown)
-    draw.pop_clip_rect()
+    room = right - imgui.calc_text_size(shown).x
+    # Clipped on the CPU: a clip rectangle would make each bar a draw call of its own.
+    clip, font = imgui.ImVec4(least.x, least.y, room - pad.x, most.y), imgui.get_font()
+    at, name = ImVec2(least.x + pad.x, y), color32(HELD if held else TEXT)
+    draw.add_text(font, imgui.get_font_size(), at, name, text, 0.0, clip)
+    draw.add_text(ImVec2(room, y), color32(HELD if held else QUIET), shown)
 
 
 def quiet(text: str) -> None:
@@ -130,8 +136,8 @@ def choice(label: str, chosen: bool, note: str = "") -> bool:
     height = imgui.get_text_line_height()
     y = (least.y + most.y - height) / 2
     if chosen:
-        draw.add_circle_filled(ImVec2(least.x + pad + 3, y + height / 2), 3, color32(ACCENT))
-    draw.add_text(ImVec2(least.x + pad + 14, y), color32(TEXT if chosen else QUIET), label)
+        draw.add_circle_filled(ImVec2(least.x + pad + units(3), y + height / 2), units(3), color32(ACCENT))
+    draw.add_text(ImVec2(least.x + pad + units(14), y), color32(TEXT if chosen else QUIET), label)
     size = imgui.calc_text_size(note)
     draw.add_text(ImVec2(most.x - pad - size.x, y), color32(QUIET), note)
     return picked

@@ -387,6 +387,7 @@ def test_a_failing_source_costs_its_pictures_and_is_said(play):
         player.step()
     (toast,) = player.viewer.toasts.current(player.clock())
     assert toast.count == 3
+    assert player.gui.is_moving  # so that the message is drawn though the face is not
     assert "finite" in toast.text
 
 

@@ -89,6 +89,20 @@ def test_it_starts_with_a_quick_deformer_and_settles_on_the_one_that_suits(show)
     assert not viewer.is_settling
 
 
+def test_a_network_that_does_not_load_is_said_once_and_the_quick_deformer_stays(show, monkeypatch):
+    def fails(*_):
+        raise ArgumentError("no network")
+
+    monkeypatch.setattr("cap4d.app.viewer.with_deformer", fails)
+    viewer = show()
+    for _ in range(3):
+        viewer.settle()
+        viewer.poll()
+    assert [t.count for t in viewer.toasts.current(viewer.now)] == [1]
+    assert viewer.avatar.tier == "off"
+    assert not viewer.is_settling
+
+
 def test_a_deformer_that_was_asked_for_is_there_at_once(show):
     assert show(deformer="full").loaded.is_settled
     assert show("plain.cap4d").loaded.is_settled  # it has one only
