@@ -134,6 +134,15 @@ class FaceSolver:
         """The pose in which the avatar's own resting face lies nearest, by what expressions hardly move."""
         return self._placed(sight, self.rest, _start(sight, self.rest))
 
+    def fresh(self, sight: Sight) -> Face | None:
+        """The frame as if the avatar's own person were in it, without a memory."""
+        face, none = None, np.zeros((478, 3))
+        for _ in range(3):
+            face = self._solve(sight, none, face)
+            if face is None:
+                break
+        return face
+
     def landmarks(self, expr: np.ndarray | None = None) -> np.ndarray:
         """[478, 3] m the avatar's landmarks with an expression; of the irises the pupils only."""
         points = np.zeros((478, 3))
@@ -150,7 +159,7 @@ class FaceSolver:
     def _solve(self, sight: Sight, offset: np.ndarray, start: Face | None) -> Face | None:
         rest = self.rest + offset[:N_SKIN]
         face = start if start is not None else self._placed(sight, rest, _start(sight, rest))
-        expr = face.expr if len(face.expr) else np.zeros(len(self.low))
+        expr = face.expr if start is not None else np.zeros(len(self.low))
         rotmat, tra = face.rotmat, face.tra
         gains = lid_gains(self.rest, rest)
         for _ in range(STEPS):

@@ -19,6 +19,9 @@ SECONDS = 1.0  # of frames make a resting face
 PATIENCE = 4.0  # s, for frames in which the mouth is closed
 KEPT = 45  # frames
 LEARNING = 30.0  # s in which what no expression explains becomes part of the resting face
+LIKENESS, STRANGER = 2.6, 3.6
+"""px of a 300 px face: how well an avatar's own face explains the person in front of the camera, root mean
+square. 2.3 for the person it was made of, 4.6 and more for others."""
 MOUTH_OPEN = 0.12  # lips' distance against the mouth's width from which a face is not at rest
 INNER_LIPS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 
@@ -51,7 +54,7 @@ class Neutral:
             return
         self._began = t if self._began is None else self._began
         kept = self._frames if mouth_opening(sight.rays) < MOUTH_OPEN else self._open
-        kept.append(self._seen(sight, self.solver.resting(sight), expr=None))
+        kept.append(self._at_rest(sight))
         self.offset = _with_closed_lips(np.median(np.stack(self._frames or self._open), 0))
         closed = len(self._frames) and self._spent(t) >= SECONDS
         self.settled = bool(closed or self._spent(t) >= PATIENCE)
@@ -70,6 +73,21 @@ class Neutral:
 
     def _spent(self, t: float) -> float:
         return t - (t if self._began is None else self._began)
+
+    def _at_rest(self, sight: Sight) -> np.ndarray:
+        """[478, 3] m: the offset of a resting face.
+
+        An avatar of this very person explains it without one, and knows the expression that it rests in:
+        the more so, the more that is taken over.
+        """
+        face = self.solver.resting(sight)
+        alike = self.solver.fresh(sight)
+        if alike is None:
+            return self._seen(sight, face, expr=None)
+        share = np.clip((STRANGER - alike.residual) / (STRANGER - LIKENESS), 0, 1)
+        if share > 0.5:
+            face = alike
+        return self._seen(sight, face, expr=share * alike.expr)
 
     def _seen(self, sight: Sight, face: Face, *, expr: np.ndarray | None) -> np.ndarray:
         """[478, 3] m: the offset that explains a frame, across the line of sight."""
