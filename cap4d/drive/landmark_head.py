@@ -21,6 +21,9 @@ SH_0 = 0.28209479177387814  # the constant spherical harmonic
 NEIGHBOURS = 9  # landmarks around one that say how deep it lies
 BACKWARD = -0.1  # of a unit normal's z: no part of a face
 MAX_STEP = 0.012  # m from their depth: more is a place behind the face
+ON_FACE, ACROSS = 0.6, 0.25
+"""Shares of an expression's largest motion on the head: what landmarks must have of it, and what must be
+across the line of sight (a picture hardly shows a jaw that comes forward)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +33,7 @@ class LandmarkHead:
     Args:
         subject: It stands on the landmarks; rig axes, m.
         known: bool[P] False where a landmark was not found.
-        expression_range: float32[E, 2].
+        expression_range: float32[E, 2]; 0 to 0 for an expression that landmarks do not show.
         eyes: float32[2, 3] m, the centres of the right and the left eyeball, or None.
     """
 
@@ -55,7 +58,9 @@ def find_landmark_head(bundle: Bundle) -> LandmarkHead:
             continue
         subject = bundle.subject.resample(found.vertices, found.bary)
         known = found.known & ~_astray(subject.neutral, found.known)
-        return LandmarkHead(subject, known, bundle.expression_range, _eyes(bundle.subject))
+        shown = _shown(bundle.subject, subject, known)
+        limits = np.where(shown[:, None], bundle.expression_range, 0)
+        return LandmarkHead(subject, known, limits, _eyes(bundle.subject))
     raise ArgumentError("webcam: expected an avatar with a face; MediaPipe sees none in this one's picture")
 
 
@@ -126,6 +131,15 @@ def _astray(points: np.ndarray, known: np.ndarray) -> np.ndarray:
     gaps[:, ~known] = np.inf
     around = np.argsort(gaps, 1)[:, 1 : NEIGHBOURS + 1]
     return np.abs(points[:, 2] - np.median(points[around, 2], 1)) > MAX_STEP
+
+
+def _shown(head: Subject, landmarks: Subject, known: np.ndarray) -> np.ndarray:
+    """bool[E] expressions whose motion is on the landmarks (no tongue), and not all towards the camera."""
+    rigid = _of_head(head) & (head.skin_weights.sum(1) < 0.5)
+    most = np.linalg.norm(head.expression_basis[:, rigid], axis=-1).max(1)
+    seen = landmarks.expression_basis[:, known]
+    across = np.linalg.norm(seen[..., :2], axis=-1).max(1)
+    return (np.linalg.norm(seen, axis=-1).max(1) > ON_FACE * most) & (across > ACROSS * most)
 
 
 def _eyes(subject: Subject) -> np.ndarray | None:

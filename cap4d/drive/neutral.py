@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,9 +15,9 @@ from cap4d.drive.face_solver import (
     unproject,
 )
 
-SECONDS = 1.0  # of frames make a resting face
-PATIENCE = 4.0  # s, for frames in which the mouth is closed
-KEPT = 45  # frames
+SECONDS = 1.0  # every frame of which is taken for a resting face
+LONGER = 8.0  # s, in which some more are
+EVERY = 0.2  # s
 LEARNING = 30.0  # s in which what no expression explains becomes part of the resting face
 LIKENESS, STRANGER = 2.6, 3.6
 """px of a 300 px face: how well an avatar's own face explains the person in front of the camera, root mean
@@ -26,10 +26,21 @@ MOUTH_OPEN = 0.12  # lips' distance against the mouth's width from which a face 
 INNER_LIPS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 
 
+@dataclass(frozen=True, eq=False)
+class _Resting:
+    """The `offset` [478, 3] m that a frame gives if its face is at rest, and how much `strain` speaks against
+    that: the expressions that the avatar's own face would need for it.
+    """
+
+    offset: np.ndarray
+    strain: float
+
+
 class Neutral:
     """A running estimate of where a person's landmarks lie on the avatar's head.
 
-    The median over the first second of frames with closed lips, then slow learning.
+    From the first second, and less often from the next seven: the median over the least strained third of the
+    faces with closed lips (of all, while there are none); then slow learning of what no expression explains.
 
     Args:
         solver: The avatar's.
@@ -42,52 +53,45 @@ class Neutral:
     def restart(self) -> None:
         """Somebody else may sit down."""
         self.offset = np.zeros((478, 3))
-        self._frames: deque[np.ndarray] = deque(maxlen=KEPT)
-        self._open: deque[np.ndarray] = deque(maxlen=KEPT)
+        self._closed: list[_Resting] = []
+        self._open: list[_Resting] = []
         self._began: float | None = None
-        self._last = 0.0
-        self.settled = False
+        self._taken = self._learned = 0.0
 
     def before(self, sight: Sight, t: float) -> None:
-        """While it settles: takes a frame in, before it is solved."""
-        if self.settled:
-            return
+        """Takes a frame in that is about to be solved, if it still counts."""
         self._began = t if self._began is None else self._began
-        kept = self._frames if mouth_opening(sight.rays) < MOUTH_OPEN else self._open
+        spent = t - self._began
+        if spent > LONGER or (spent > SECONDS and t - self._taken < EVERY):
+            return
+        self._taken = t
+        kept = self._closed if mouth_opening(sight.rays) < MOUTH_OPEN else self._open
         kept.append(self._at_rest(sight))
-        self.offset = _with_closed_lips(np.median(np.stack(self._frames or self._open), 0))
-        closed = len(self._frames) and self._spent(t) >= SECONDS
-        self.settled = bool(closed or self._spent(t) >= PATIENCE)
-        self._last = t
+        if kept is self._closed or not self._closed:
+            self.offset = _with_closed_lips(_middle(kept))
 
     def after(self, sight: Sight, face: Face, t: float) -> None:
-        """Once it has settled: learns from a solved frame."""
-        if not self.settled:
+        """Learns from a solved frame."""
+        share = np.clip((t - self._learned) / LEARNING, 0, 0.02)
+        self._learned = t
+        if self._began is None or t - self._began <= LONGER:
             return
-        share = np.clip((t - self._last) / LEARNING, 0, 0.02)
-        self._last = t
-        seen = self._seen(sight, face, expr=face.expr)
-        learns = np.ones(478, bool)
-        learns[[i for lids in LIDS for i in lids]] = False
-        self.offset[learns] += share * (seen - self.offset)[learns]
+        change = share * (self._seen(sight, face, expr=face.expr) - self.offset)
+        change[[i for lids in LIDS for i in lids]] = 0  # their motion has another scale
+        self.offset = self.offset + change
 
-    def _spent(self, t: float) -> float:
-        return t - (t if self._began is None else self._began)
+    def _at_rest(self, sight: Sight) -> _Resting:
+        """A frame as that of a resting face.
 
-    def _at_rest(self, sight: Sight) -> np.ndarray:
-        """[478, 3] m: the offset of a resting face.
-
-        An avatar of this very person explains it without one, and knows the expression that it rests in:
-        the more so, the more that is taken over.
+        An avatar of this very person explains it without an offset, and knows the expression that it rests
+        in: the more so, the more that is taken over.
         """
-        face = self.solver.resting(sight)
-        alike = self.solver.fresh(sight)
+        face, alike = self.solver.resting(sight), self.solver.fresh(sight)
         if alike is None:
-            return self._seen(sight, face, expr=None)
+            return _Resting(self._seen(sight, face, expr=None), np.inf)
         share = np.clip((STRANGER - alike.residual) / (STRANGER - LIKENESS), 0, 1)
-        if share > 0.5:
-            face = alike
-        return self._seen(sight, face, expr=share * alike.expr)
+        offset = self._seen(sight, alike if share > 0.5 else face, expr=share * alike.expr)
+        return _Resting(offset, float(np.abs(alike.expr).sum()))
 
     def _seen(self, sight: Sight, face: Face, *, expr: np.ndarray | None) -> np.ndarray:
         """[478, 3] m: the offset that explains a frame, across the line of sight."""
@@ -96,6 +100,12 @@ class Neutral:
             points[list(IRISES)] += self.solver.pupil_motion(face.gaze)
         depth = -(points + self.offset) @ face.rotmat[2] - face.tra[2]
         return unproject(sight.rays, face.rotmat, face.tra, depth) - points
+
+
+def _middle(frames: list[_Resting]) -> np.ndarray:
+    """[478, 3] the median of the least strained third."""
+    frames = sorted(frames, key=lambda frame: frame.strain)
+    return np.median(np.stack([frame.offset for frame in frames[: -(-len(frames) // 3)]]), 0)
 
 
 def mouth_opening(rays: np.ndarray) -> float:
