@@ -34,7 +34,7 @@ LOST = 20.0  # px: the face is not where it was
 """Root mean square beyond which the pose of the last frame is dropped and the search starts anew."""
 LIDS = (RIGHT_LIDS, LEFT_LIDS)
 LID_PAIRS = (((159, 145), (158, 153), (160, 144)), ((386, 374), (385, 380), (387, 373)))
-CLOSED = 0.25  # of the open lids' distance is what landmarks still show of closed ones
+CLOSED = 0.3  # of the open lids' distance is what landmarks still show of closed ones
 
 
 @dataclass(frozen=True, eq=False)

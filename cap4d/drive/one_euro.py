@@ -16,7 +16,7 @@ class OneEuro:
         speed_cutoff: Hz, of the filter on the speed.
     """
 
-    def __init__(self, cutoff: float, beta: float, *, speed_cutoff: float = 1.0) -> None:
+    def __init__(self, cutoff: float, beta: float, speed_cutoff: float = 1.0) -> None:
         self.cutoff, self.beta, self.speed_cutoff = cutoff, beta, speed_cutoff
         self._t, self._value, self._speed = 0.0, None, 0.0
 
