@@ -34,7 +34,7 @@ LOST = 20.0  # px: the face is not where it was
 """Root mean square beyond which the pose of the last frame is dropped and the search starts anew."""
 LIDS = (RIGHT_LIDS, LEFT_LIDS)
 LID_PAIRS = (((159, 145), (158, 153), (160, 144)), ((386, 374), (385, 380), (387, 373)))
-CLOSED = 0.3  # of the open lids' distance is what landmarks still show of closed ones
+HALF, CLOSED = 0.7, 0.3  # of the open lids' distance: from here on it shrinks faster; shut lids still show this
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class FaceSolver:
         self.low, self.high = np.asarray(head.expression_range, np.float64).T
         self.weights = _weights(head.known)
         self.gaps = np.array([pair for pair in GAPS if head.known[list(pair)].all()]).T
-        self._rigid = np.isin(np.arange(N_SKIN), RIGID) & head.known[:N_SKIN]
+        self._rigid = np.array([i for i in RIGID if head.known[i]])
         signed = self.low < 0
         self._ridge = np.where(signed, SIGNED_RIDGE, RIDGE)
         self._sparse = np.where(signed, 0, SPARSE / 2)
@@ -137,7 +137,7 @@ class FaceSolver:
     def fresh(self, sight: Sight) -> Face | None:
         """The frame as if the avatar's own person were in it, without a memory."""
         face, none = None, np.zeros((478, 3))
-        for _ in range(3):
+        for _ in range(2):
             face = self._solve(sight, none, face)
             if face is None:
                 break
@@ -161,9 +161,9 @@ class FaceSolver:
         face = start if start is not None else self._placed(sight, rest, _start(sight, rest))
         expr = face.expr if start is not None else np.zeros(len(self.low))
         rotmat, tra = face.rotmat, face.tra
-        gains = lid_gains(self.rest, rest)
         for _ in range(STEPS):
-            step = _Step(sight, rest, self.motion, expr, rotmat, tra, gains)
+            rays = self._with_lid_gains(sight, rest, rotmat, tra)
+            step = _Step(rays, sight.scale, rest, self.motion, expr, rotmat, tra)
             normal, right = step.normal_equations(self.weights, self.gaps)
             at = np.arange(6, 6 + len(expr))
             normal[at, at] += self._ridge
@@ -175,22 +175,36 @@ class FaceSolver:
             expr = x[6:]
             if not np.isfinite(tra).all() or tra[2] > 0:
                 return None
-        residual = float(np.sqrt((self.weights * step.residual(self.motion @ expr)).sum() / self.weights.sum()))
+        residual = float(
+            np.sqrt((self.weights * step.residual(self.motion @ expr)).sum() / self.weights.sum())
+        )
         gaze = self._gaze(sight, rest, offset, rotmat, tra)
         return Face(expr, gaze, rotmat, tra, residual)
+
+    def _with_lid_gains(self, sight: Sight, rest: np.ndarray, rotmat: np.ndarray, tra: np.ndarray):
+        """[468, 2] rays that move the avatar's lids as far as the person's move."""
+        still = project(rest @ rotmat.T + tra)[0]
+        rays = sight.rays[:N_SKIN].copy()
+        opened = lid_distances(rays) / np.maximum(lid_distances(still), 1e-9)
+        for lids, gain in zip(LIDS, lid_gains(self.rest, rest, opened), strict=True):
+            at = list(lids)
+            rays[at] = still[at] + gain * (rays[at] - still[at])
+        return rays
 
     def _placed(self, sight: Sight, rest: np.ndarray, face: Face) -> Face:
         """Gauss-Newton on the pose alone."""
         rotmat, tra = face.rotmat, face.tra
-        nothing = np.zeros((N_SKIN, 3, 0))
+        rays, rest = sight.rays[self._rigid], rest[self._rigid]
+        ones, nothing = np.ones(len(rest)), np.zeros((len(rest), 3, 0))
         for _ in range(FIRST_STEPS):
-            step = _Step(sight, rest, nothing, np.zeros(0), rotmat, tra, None)
-            normal, right = step.normal_equations(self._rigid.astype(float), None)
+            step = _Step(rays, sight.scale, rest, nothing, np.zeros(0), rotmat, tra)
+            normal, right = step.normal_equations(ones, None)
             x = np.linalg.solve(normal, right)
             rotmat, tra = step.moved(np.clip(x, -0.3, 0.3))
             if np.abs(x).max() < 1e-4:
                 break
         return Face(np.zeros(0), np.zeros(2), rotmat, tra, 0.0)
+
     def _gaze(self, sight, rest, offset, rotmat, tra) -> np.ndarray:
         """[2] pitch and yaw that put the pupils where the irises are, as far as the lids are open."""
         if self.head.eyes is None:
@@ -208,24 +222,17 @@ class FaceSolver:
 class _Step:
     """The picture of a face, and how it changes with pose and expression."""
 
-    def __init__(self, sight, rest, motion, expr, rotmat, tra, gains) -> None:
-        self.sight, self.rotmat, self.tra, self.expr = sight, rotmat, tra, expr
+    def __init__(self, rays, scale, rest, motion, expr, rotmat, tra) -> None:
+        self.rotmat, self.tra, self.expr = rotmat, tra, expr
         self.arm = (rest + motion @ expr) @ rotmat.T
         self.pivot = self.arm.mean(0)
-        self.projected, slope = project(self.arm + tra)
-        self.target = sight.rays[:N_SKIN]
-        if gains is not None:
-            self.target = _with_lid_gains(self.target, project(rest @ rotmat.T + tra)[0], gains)
-        self.by_motion = sight.scale * (slope @ rotmat)  # [P, 2, 3]
+        projected, slope = project(self.arm + tra)
+        self.off = scale * (rays - projected)  # [P, 2] from the model to the landmarks, px of a 300 px face
+        self.by_motion = scale * (slope @ rotmat)  # [P, 2, 3]
         turn = -skew(self.arm - self.pivot)
         self.rows = np.concatenate(
-            [sight.scale * (slope @ turn), sight.scale * slope, self.by_motion @ motion], 2
+            [scale * (slope @ turn), scale * slope, self.by_motion @ motion], 2
         )
-
-    @property
-    def off(self) -> np.ndarray:
-        """[P, 2] from the model to the landmarks, px of a 300 px face."""
-        return self.sight.scale * (self.target - self.projected)
 
     def residual(self, motion: np.ndarray) -> np.ndarray:
         """[P] squares of what is left after another expression's `motion` [P, 3]; the pose as it was."""
@@ -282,17 +289,19 @@ def lid_distances(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[pairs[..., 0]] - points[pairs[..., 1]], axis=-1).mean(1)
 
 
-def lid_gains(avatar: np.ndarray, person: np.ndarray) -> np.ndarray:
-    """[2] right and left: what a motion of the person's lids is on the avatar: both close together."""
-    return np.clip(lid_distances(avatar) / np.maximum(lid_distances(person), 1e-4) / (1 - CLOSED), 0.4, 3)
+def lid_gains(avatar: np.ndarray, person: np.ndarray, opened: np.ndarray) -> np.ndarray:
+    """[2] right and left: what a motion of the person's lids is on the avatar.
 
+    Small motions keep their share of the open eye; the rest grows so that both close together.
 
-def _with_lid_gains(rays: np.ndarray, still: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    target = rays.copy()
-    for lids, gain in zip(LIDS, gains, strict=True):
-        at = list(lids)
-        target[at] = still[at] + gain * (rays[at] - still[at])
-    return target
+    Args:
+        avatar, person: [P, 3] m, at rest.
+        opened: [2] see `openness`.
+    """
+    shown = np.where(opened > HALF, opened, HALF * (opened - CLOSED) / (HALF - CLOSED)).clip(0)
+    growth = (1 - shown) / np.maximum(1 - np.minimum(opened, 0.99), 0.01)
+    growth = np.where(opened > HALF, 1, growth)
+    return np.clip(growth * lid_distances(avatar) / np.maximum(lid_distances(person), 1e-4), 0.4, 3)
 
 
 def _start(sight: Sight, rest: np.ndarray) -> Face:
@@ -301,9 +310,7 @@ def _start(sight: Sight, rest: np.ndarray) -> Face:
     depth = float(np.sqrt(extent[0] * extent[1] / sight.size.prod()))
     rotmat = axis_angle_to_rotmat(np.array([0, 0, sight.roll]))
     x, y = sight.rays[:N_SKIN].mean(0)
-    return Face(
-        np.zeros(0), np.zeros(2), rotmat, np.array([x, -y, -1]) * depth - rotmat @ rest.mean(0), 0.0
-    )
+    return Face(np.zeros(0), np.zeros(2), rotmat, np.array([x, -y, -1]) * depth - rotmat @ rest.mean(0), 0.0)
 
 
 def _motion(head: LandmarkHead) -> np.ndarray:
