@@ -23,7 +23,7 @@ FACE_SIZE = 300.0  # residuals are in px of a face this wide
 FOCAL = 1.3  # of the picture's larger side: nothing tells focal length from distance
 MIN_FACE = 24.0  # px; a smaller face says nothing
 PLAIN, FEATURE, OUTLINE, CHINS, IRIS, GAP = 0.15, 0.5, 0.02, 0.3, 2.0, 1.0  # weights of landmarks
-OUTLIER = 3.0  # px from which residuals count linearly
+OUTLIER, LID_OUTLIER = 3.0, 30.0  # px from which residuals count linearly; lids move far in one frame
 RIDGE, SPARSE = 1.0, 60.0  # of squared expressions; of the sum of non-negative ones
 SIGNED_RIDGE = 20.0  # of expressions that go both ways, where a sum says nothing
 GAZE = 5.0  # per rad^2 from straight ahead
@@ -104,6 +104,8 @@ class FaceSolver:
         self.weights = _weights(head.known)
         self.gaps = np.array([pair for pair in GAPS if head.known[list(pair)].all()]).T
         self._rigid = np.array([i for i in RIGID if head.known[i]])
+        self.outliers = np.full(N_SKIN, OUTLIER)
+        self.outliers[[i for lids in LIDS for i in lids]] = LID_OUTLIER
         signed = self.low < 0
         self._ridge = np.where(signed, SIGNED_RIDGE, RIDGE)
         self._sparse = np.where(signed, 0, SPARSE / 2)
@@ -163,7 +165,7 @@ class FaceSolver:
         rotmat, tra = face.rotmat, face.tra
         for _ in range(STEPS):
             rays = self._with_lid_gains(sight, rest, rotmat, tra)
-            step = _Step(rays, sight.scale, rest, self.motion, expr, rotmat, tra)
+            step = _Step(rays, sight.scale, rest, self.motion, expr, rotmat, tra, self.outliers)
             normal, right = step.normal_equations(self.weights, self.gaps)
             at = np.arange(6, 6 + len(expr))
             normal[at, at] += self._ridge
@@ -222,8 +224,8 @@ class FaceSolver:
 class _Step:
     """The picture of a face, and how it changes with pose and expression."""
 
-    def __init__(self, rays, scale, rest, motion, expr, rotmat, tra) -> None:
-        self.rotmat, self.tra, self.expr = rotmat, tra, expr
+    def __init__(self, rays, scale, rest, motion, expr, rotmat, tra, outliers=OUTLIER) -> None:
+        self.rotmat, self.tra, self.expr, self.outliers = rotmat, tra, expr, outliers
         self.arm = (rest + motion @ expr) @ rotmat.T
         self.pivot = self.arm.mean(0)
         projected, slope = project(self.arm + tra)
@@ -243,12 +245,12 @@ class _Step:
     def normal_equations(self, weights, gaps) -> tuple[np.ndarray, np.ndarray]:
         """[6 + E, 6 + E] and [6 + E] for the change of pose and the expression itself."""
         off = self.off
-        weight = weights / np.sqrt(1 + (off**2).sum(-1) / OUTLIER**2)
+        weight = weights * _trust(off, self.outliers)
         rows, off = self.rows, off + self.rows[:, :, 6:] @ self.expr
         if gaps is not None:
             upper, lower = gaps
             gap = self.off[upper] - self.off[lower]
-            weight = np.concatenate([weight, GAP / np.sqrt(1 + (gap**2).sum(-1) / OUTLIER**2)])
+            weight = np.concatenate([weight, GAP * _trust(gap, LID_OUTLIER)])
             rows = np.concatenate([rows, rows[upper] - rows[lower]])
             off = np.concatenate([off, off[upper] - off[lower]])
         root = np.sqrt(weight)[:, None]
@@ -259,6 +261,11 @@ class _Step:
         """The pose after a turn about the face's middle and a shift."""
         turn = axis_angle_to_rotmat(change[:3])
         return turn @ self.rotmat, self.tra + change[3:] + self.pivot - turn @ self.pivot
+
+
+def _trust(off: np.ndarray, outlier: np.ndarray | float) -> np.ndarray:
+    """[P] weights that make squares of [P, 2] pseudo-Huber losses."""
+    return 1 / np.sqrt(1 + (off**2).sum(-1) / outlier**2)
 
 
 def project(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -298,9 +305,11 @@ def lid_gains(avatar: np.ndarray, person: np.ndarray, opened: np.ndarray) -> np.
         avatar, person: [P, 3] m, at rest.
         opened: [2] see `openness`.
     """
-    shown = np.where(opened > HALF, opened, HALF * (opened - CLOSED) / (HALF - CLOSED)).clip(0)
+    both = np.clip((HALF - opened.max()) / (HALF - CLOSED) * 2, 0, 1)  # a blink is of both eyes, a wink of one
+    meant = opened + both * (opened.mean() - opened)
+    shown = np.where(meant > HALF, meant, HALF * (meant - CLOSED) / (HALF - CLOSED)).clip(0)
     growth = (1 - shown) / np.maximum(1 - np.minimum(opened, 0.99), 0.01)
-    growth = np.where(opened > HALF, 1, growth)
+    growth = np.where(meant > HALF, 1, growth)
     return np.clip(growth * lid_distances(avatar) / np.maximum(lid_distances(person), 1e-4), 0.4, 3)
 
 

@@ -134,12 +134,16 @@ def _astray(points: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _shown(head: Subject, landmarks: Subject, known: np.ndarray) -> np.ndarray:
-    """bool[E] expressions whose motion is on the landmarks (no tongue), and not all towards the camera."""
+    """bool[E] expressions whose motion is on the landmarks (no tongue), and not all towards the camera.
+
+    Gaze is found by the irises; ARKit's expressions of it move the lids, and would be taken for a blink.
+    """
     rigid = _of_head(head) & (head.skin_weights.sum(1) < 0.5)
     most = np.linalg.norm(head.expression_basis[:, rigid], axis=-1).max(1)
     seen = landmarks.expression_basis[:, known]
     across = np.linalg.norm(seen[..., :2], axis=-1).max(1)
-    return (np.linalg.norm(seen, axis=-1).max(1) > ON_FACE * most) & (across > ACROSS * most)
+    of_gaze = np.array([name.startswith("eyeLook") for name in head.expression_names])
+    return ~of_gaze & (np.linalg.norm(seen, axis=-1).max(1) > ON_FACE * most) & (across > ACROSS * most)
 
 
 def _eyes(subject: Subject) -> np.ndarray | None:
