@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
 
+import av
 import numpy as np
 
 from cap4d.errors import ArgumentError, DataError
@@ -81,12 +82,9 @@ class PlayedVideo:
         clock: Callable[[], float] = time.monotonic,
         wait: Callable[[float], None] = time.sleep,
     ) -> None:
-        from cap4d.track.footage import open_footage
-
-        self._footage = open_footage(path)
-        if not self._footage.is_video:
-            raise DataError(path, "video", expected="a video", found="a picture")
-        self._clock, self._wait = clock, wait
+        self._path, self._clock, self._wait = path, clock, wait
+        with _opened(path) as container:
+            self._period = float(1 / (container.streams.video[0].average_rate or FPS))
         self._frames: Iterator[np.ndarray] = iter(())
         self._due: float | None = None
 
@@ -94,10 +92,10 @@ class PlayedVideo:
         """See `CameraDevice`; None if the file does not decode any more."""
         picture = next(self._frames, None)
         if picture is None:
-            self._frames = self._footage.frames()
+            self._frames = _decoded(self._path)
             picture = next(self._frames, None)
         now = self._clock()
-        self._due = now if self._due is None else max(self._due + 1 / self._footage.fps, now - 1)
+        self._due = now if self._due is None else max(self._due + self._period, now - 1)
         if self._due > now:
             self._wait(self._due - now)
         return picture
@@ -155,6 +153,28 @@ class Newest:
             self._changed.wait_for(lambda: self._thing is not None, timeout)
             thing, self._thing = self._thing, None
             return thing
+
+
+def _opened(path: Path) -> av.container.InputContainer:
+    try:
+        container = av.open(str(path))
+    except (av.FFmpegError, OSError) as error:
+        raise DataError(path, "video", expected="a readable video", found=error.strerror) from error
+    if not container.streams.video:
+        container.close()
+        raise DataError(path, "video", expected="a video stream", found="none")
+    return container
+
+
+def _decoded(path: Path) -> Iterator[np.ndarray]:
+    """uint8[H, W, 3], upright: a display matrix turns a picture counter-clockwise by `rotation` degrees."""
+    with _opened(path) as container:
+        try:
+            for frame in container.decode(video=0):
+                quarters = round(frame.rotation / 90) % 4
+                yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarters))
+        except av.FFmpegError as error:
+            raise DataError(path, "video", expected="frames that decode", found=error.strerror) from error
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ FOCAL = 1.3  # of the picture's larger side: nothing tells focal length from dis
 MIN_FACE = 24.0  # px; a smaller face says nothing
 PLAIN, FEATURE, OUTLINE, CHINS, IRIS, GAP = 0.15, 0.5, 0.02, 0.3, 2.0, 1.0  # weights of landmarks
 OUTLIER, LID_OUTLIER = 3.0, 30.0  # px from which residuals count linearly; lids move far in one frame
-RIDGE, SPARSE = 1.0, 60.0  # of squared expressions; of the sum of non-negative ones
+RIDGE, SPARSE = 20.0, 60.0  # of squared expressions; of the sum of non-negative ones
 SIGNED_RIDGE = 20.0  # of expressions that go both ways, where a sum says nothing
 GAZE = 5.0  # per rad^2 from straight ahead
 EYE_RADIUS = 0.0125  # m from an eyeball's centre to its pupil (facts of anatomy: 24 mm across)
@@ -34,6 +34,7 @@ LOST = 20.0  # px: the face is not where it was
 """Root mean square beyond which the pose of the last frame is dropped and the search starts anew."""
 LIDS = (RIGHT_LIDS, LEFT_LIDS)
 LID_PAIRS = (((159, 145), (158, 153), (160, 144)), ((386, 374), (385, 380), (387, 373)))
+WINK = 0.75  # an eye less open than this takes part in a blink of both, whose mean then holds
 HALF, CLOSED = 0.7, 0.3  # of the open lids' distance: from here on it shrinks faster; shut lids still show this
 
 
@@ -305,7 +306,7 @@ def lid_gains(avatar: np.ndarray, person: np.ndarray, opened: np.ndarray) -> np.
         avatar, person: [P, 3] m, at rest.
         opened: [2] see `openness`.
     """
-    both = np.clip((HALF - opened.max()) / (HALF - CLOSED) * 2, 0, 1)  # a blink is of both eyes, a wink of one
+    both = np.clip((WINK - opened.max()) / 0.1, 0, 1)
     meant = opened + both * (opened.mean() - opened)
     shown = np.where(meant > HALF, meant, HALF * (meant - CLOSED) / (HALF - CLOSED)).clip(0)
     growth = (1 - shown) / np.maximum(1 - np.minimum(opened, 0.99), 0.01)
