@@ -21,7 +21,7 @@ N_SKIN = 468
 IRISES = (468, 473)  # centres: right, left
 FACE_SIZE = 300.0  # residuals are in px of a face this wide
 FOCAL = 1.3  # of the picture's larger side: nothing tells focal length from distance
-MIN_FACE = 24.0  # px; a smaller face says nothing
+MIN_FACE, MAX_PX = 24.0, 1e5  # a face of fewer px says nothing; no landmark is farther away, nor NaN
 PLAIN, FEATURE, OUTLINE, CHINS, IRIS, GAP = 0.15, 0.5, 0.02, 0.3, 2.0, 1.0  # weights of landmarks
 OUTLIER, LID_OUTLIER = 3.0, 30.0  # px from which residuals count linearly; lids move far in one frame
 RIDGE, SPARSE = 20.0, 60.0  # of squared expressions; of the sum of non-negative ones
@@ -35,7 +35,9 @@ LOST = 20.0  # px: the face is not where it was
 LIDS = (RIGHT_LIDS, LEFT_LIDS)
 LID_PAIRS = (((159, 145), (158, 153), (160, 144)), ((386, 374), (385, 380), (387, 373)))
 WINK = 0.75  # an eye less open than this takes part in a blink of both, whose mean then holds
-HALF, CLOSED = 0.7, 0.3  # of the open lids' distance: from here on it shrinks faster; shut lids still show this
+HALF, CLOSED = 0.7, 0.4
+"""Of the open lids' distance: from here on it shrinks faster, and this much landmarks still show of shut lids
+(0.1 to 0.4 on pictures of shut eyes)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,7 @@ class Sight:
 
 def look(points: np.ndarray, width: int, height: int) -> Sight | None:
     """Landmarks [478, 2] px (pixel centres at .5) of a picture; None: no face that could be told apart."""
-    if points.shape != (478, 2) or not np.isfinite(points).all():
+    if points.shape != (478, 2) or not (np.abs(points) < MAX_PX).all():
         return None
     focal = FOCAL * max(width, height)
     rays = (points.astype(np.float64) - [width / 2, height / 2]) / focal
@@ -84,7 +86,7 @@ def look(points: np.ndarray, width: int, height: int) -> Sight | None:
     level = rays[:N_SKIN] @ np.array([[cos, sin], [-sin, cos]])
     size = np.ptp(level, axis=0)
     face = float(np.sqrt(size.prod()))
-    if not MIN_FACE <= face * focal or face > 10 or size.min() < 0.2 * size.max():
+    if face * focal < MIN_FACE or size.min() < 0.2 * size.max():
         return None
     return Sight(rays, FACE_SIZE / face, roll, size)
 
@@ -233,9 +235,7 @@ class _Step:
         self.off = scale * (rays - projected)  # [P, 2] from the model to the landmarks, px of a 300 px face
         self.by_motion = scale * (slope @ rotmat)  # [P, 2, 3]
         turn = -skew(self.arm - self.pivot)
-        self.rows = np.concatenate(
-            [scale * (slope @ turn), scale * slope, self.by_motion @ motion], 2
-        )
+        self.rows = np.concatenate([scale * (slope @ turn), scale * slope, self.by_motion @ motion], 2)
 
     def residual(self, motion: np.ndarray) -> np.ndarray:
         """[P] squares of what is left after another expression's `motion` [P, 3]; the pose as it was."""

@@ -24,6 +24,7 @@ LIKENESS, STRANGER = 2.6, 3.6
 square. 2.3 for the person it was made of, 4.6 and more for others."""
 MOUTH_OPEN = 0.12  # lips' distance against the mouth's width from which a face is not at rest
 INNER_LIPS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
+LID_RIMS = [i for lids in LIDS for i in lids]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ class Neutral:
         if self._began is None or t - self._began <= LONGER:
             return
         change = share * (self._seen(sight, face, expr=face.expr) - self.offset)
-        change[[i for lids in LIDS for i in lids]] = 0  # their motion has another scale
+        change[LID_RIMS] = 0
         self.offset = self.offset + change
 
     def _at_rest(self, sight: Sight) -> _Resting:
@@ -94,8 +95,9 @@ class Neutral:
         return _Resting(offset, float(np.abs(alike.expr).sum()))
 
     def _seen(self, sight: Sight, face: Face, *, expr: np.ndarray | None) -> np.ndarray:
-        """[478, 3] m: the offset that explains a frame, across the line of sight."""
+        """[478, 3] m: the offset that explains a frame, across the line of sight; eyes at rest are open."""
         points = self.solver.landmarks(expr)
+        points[LID_RIMS] = self.solver.rest[LID_RIMS]
         if expr is not None:
             points[list(IRISES)] += self.solver.pupil_motion(face.gaze)
         depth = -(points + self.offset) @ face.rotmat[2] - face.tra[2]

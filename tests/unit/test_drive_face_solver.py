@@ -119,8 +119,7 @@ def test_gains_of_lids_grow_without_a_jump():
     ids=["nan", "inf", "a point", "too few", "a line", "too small", "too far"],
 )
 def test_what_is_no_face_is_told_apart(points):
-    with np.errstate(all="ignore"):
-        assert look(points, SIZE, SIZE) is None
+    assert look(points, SIZE, SIZE) is None
 
 
 def test_landmarks_in_disorder_are_no_face_and_do_no_harm():
