@@ -19,9 +19,10 @@ SECONDS = 1.0  # every frame of which is taken for a resting face
 LONGER = 8.0  # s, in which some more are
 EVERY = 0.2  # s
 LEARNING = 30.0  # s in which what no expression explains becomes part of the resting face
-LIKENESS, STRANGER = 2.6, 3.6
-"""px of a 300 px face: how well an avatar's own face explains the person in front of the camera, root mean
-square. 2.3 for the person it was made of, 4.6 and more for others."""
+LIKENESS, STRAIN = (2.6, 3.6), (2.0, 2.8)
+"""How well an avatar's own face explains the person before the camera at rest, px of a 300 px face (root mean
+square), and the sum of the expressions it needs for that: up to the first it is this very person, from the
+second on a stranger. Measured: 2.2 and 1.4 for the person of the avatar, 2.6 and 2.9 for ICT's mean head."""
 MOUTH_OPEN = 0.12  # lips' distance against the mouth's width from which a face is not at rest
 INNER_LIPS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 LID_RIMS = [i for lids in LIDS for i in lids]
@@ -29,11 +30,17 @@ LID_RIMS = [i for lids in LIDS for i in lids]
 
 @dataclass(frozen=True, eq=False)
 class _Resting:
-    """The `offset` [478, 3] m that a frame gives if its face is at rest, and how much `strain` speaks against
-    that: the expressions that the avatar's own face would need for it.
+    """What a frame gives if its face is at rest.
+
+    Args:
+        stranger, own: [478, 3] m, the offsets if the face is another's, and if it is that of the avatar's
+            own person in the expression in which they rest.
+        residual, strain: As of `LIKENESS` and `STRAIN`; much strain speaks against a face at rest.
     """
 
-    offset: np.ndarray
+    stranger: np.ndarray
+    own: np.ndarray
+    residual: float
     strain: float
 
 
@@ -82,17 +89,12 @@ class Neutral:
         self.offset = self.offset + change
 
     def _at_rest(self, sight: Sight) -> _Resting:
-        """A frame as that of a resting face.
-
-        An avatar of this very person explains it without an offset, and knows the expression that it rests
-        in: the more so, the more that is taken over.
-        """
-        face, alike = self.solver.resting(sight), self.solver.fresh(sight)
-        if alike is None:
-            return _Resting(self._seen(sight, face, expr=None), np.inf)
-        share = np.clip((STRANGER - alike.residual) / (STRANGER - LIKENESS), 0, 1)
-        offset = self._seen(sight, alike if share > 0.5 else face, expr=share * alike.expr)
-        return _Resting(offset, float(np.abs(alike.expr).sum()))
+        face, own = self.solver.resting(sight), self.solver.fresh(sight)
+        stranger = self._seen(sight, face, expr=None)
+        if own is None:
+            return _Resting(stranger, stranger, np.inf, np.inf)
+        offset = self._seen(sight, own, expr=own.expr)
+        return _Resting(stranger, offset, own.residual, float(np.abs(own.expr).sum()))
 
     def _seen(self, sight: Sight, face: Face, *, expr: np.ndarray | None) -> np.ndarray:
         """[478, 3] m: the offset that explains a frame, across the line of sight; eyes at rest are open."""
@@ -106,8 +108,16 @@ class Neutral:
 
 def _middle(frames: list[_Resting]) -> np.ndarray:
     """[478, 3] the median of the least strained third."""
-    frames = sorted(frames, key=lambda frame: frame.strain)
-    return np.median(np.stack([frame.offset for frame in frames[: -(-len(frames) // 3)]]), 0)
+    frames = sorted(frames, key=lambda frame: frame.strain)[: -(-len(frames) // 3)]
+    likeness = [
+        (limits[1] - np.median([getattr(frame, name) for frame in frames])) / (limits[1] - limits[0])
+        for name, limits in (("residual", LIKENESS), ("strain", STRAIN))
+    ]
+    share = np.clip(min(likeness), 0, 1)
+    stranger, own = (
+        np.median(np.stack([getattr(f, name) for f in frames]), 0) for name in ("stranger", "own")
+    )
+    return stranger + share * (own - stranger)
 
 
 def mouth_opening(rays: np.ndarray) -> float:
