@@ -40,6 +40,7 @@ class Webcam:
     def __init__(self, index: int) -> None:
         import cv2
 
+        self._error = cv2.error
         with _quiet(cv2):
             self._capture = cv2.VideoCapture(index)
         if not self._capture.isOpened():
@@ -55,7 +56,10 @@ class Webcam:
 
     def read(self) -> np.ndarray | None:
         """See `CameraDevice`."""
-        taken, picture = self._capture.read()
+        try:
+            taken, picture = self._capture.read()
+        except self._error:
+            return None
         if not taken or picture is None or picture.ndim != 3:
             return None
         return np.ascontiguousarray(picture[..., ::-1])

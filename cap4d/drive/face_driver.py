@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cap4d.drive.face_solver import Face, FaceSolver, look
+from cap4d.drive.face_solver import Face, FaceSolver, Sight, look
 from cap4d.drive.landmark_head import LandmarkHead
 from cap4d.drive.neutral import Neutral
 from cap4d.drive.one_euro import OneEuro
@@ -50,6 +50,13 @@ class FaceDriver:
             return None
         if t - self._last > GONE:
             self._restart()
+        try:
+            return self._solved(sight, t)
+        except np.linalg.LinAlgError:  # a face so odd that nothing can be solved for: the next one is another
+            self.solver.reset()
+            return None
+
+    def _solved(self, sight: Sight, t: float) -> Packet | None:
         self.neutral.before(sight, t)
         face = self.solver(sight, self.neutral.offset)
         if face is None:

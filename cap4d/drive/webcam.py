@@ -20,7 +20,7 @@ from cap4d.drive.camera_device import CameraDevice, Newest, check_device, open_c
 from cap4d.drive.face_driver import FaceDriver
 from cap4d.drive.landmark_head import LandmarkHead, find_landmark_head
 from cap4d.drive.packet import Packet, Sink
-from cap4d.errors import ArgumentError, DataError
+from cap4d.errors import ArgumentError, Cap4dError
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +123,7 @@ class WebcamReceiver:
         while not stop.is_set():
             try:
                 camera = self._open(self._device)
-            except (OSError, DataError) as error:
+            except (OSError, Cap4dError) as error:
                 if not told:
                     log.warning("%s: %s; trying again every second", self.address, error)
                 told = True
@@ -141,7 +141,7 @@ class WebcamReceiver:
                 taken += 1
                 self._counts["pictures"] += 1
                 self._pictures.put((picture, self._clock()))
-        except (OSError, DataError) as error:
+        except (OSError, Cap4dError) as error:
             log.debug("%s: %s", self.address, error)
         finally:
             self.connected = False

@@ -113,3 +113,17 @@ def test_no_face_is_no_packet_and_no_harm():
     for junk in (np.full((478, 2), np.nan), np.zeros((478, 2)), np.zeros((3, 2))):
         assert film.driver(junk, SIZE, SIZE, film.t) is None
     np.testing.assert_allclose(film.show({"jawOpen": 0.5}).expr, before, atol=0.03)
+
+
+def test_hostile_landmarks_never_raise_nor_come_through():
+    rng, film = np.random.default_rng(4), Film()
+    for i in range(60):
+        points = seen() if i % 3 == 0 else rng.normal(SIZE / 2, 10 ** rng.uniform(-2, 4), (478, 2))
+        if i % 5 == 4:
+            points = seen() + rng.normal(0, 30, (478, 2))
+        film.t += 1 / FPS
+        packet = film.driver(points, SIZE, SIZE, film.t)
+        if packet is not None:
+            arrays = (packet.expr, packet.eye_rot, packet.neck_rot, packet.rot, packet.tra)
+            assert all(np.isfinite(array).all() for array in arrays)
+    assert film.show(frames=5) is not None
