@@ -14,8 +14,8 @@ CPP := CMakeLists.txt pyproject.toml $(wildcard src/cpp/*)
 SANITIZED := build/sanitize
 SANITIZERS := -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer -g -O1
 SANITIZED_TESTS := $(wildcard tests/property/test_hard_*.py) $(addprefix tests/,$(addsuffix .py,property/test_splatting_gradients \
-  $(addprefix parity/test_,player quantized_answers splatting) \
-  $(addprefix unit/test_,avatar_bound bench_floor bind mesh player_avatar player_tiers quantized_unet raster render sort splatter)))
+  $(addprefix parity/test_,float_answers player quantized_answers splatting) \
+  $(addprefix unit/test_,avatar_bound bench_floor bind float_unet mesh player_avatar player_tiers quantized_unet raster render sort splatter)))
 
 .PHONY: demo test bench lint sanitize sanitize-base sanitize-v3 sanitize-v4 sanitize-threads clean
 .DELETE_ON_ERROR:
@@ -46,7 +46,7 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/system
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' || { echo "cap4d builds with Python 3.11 or 3.12; set PYTHON=..."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install -c constraints.txt torch
-	$(PIP) install -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; o = p["optional-dependencies"]; print(*sorted({"".join(r.split()) for r in sum((o[e] for e in ("capture", "track", "fit", "dev")), p["dependencies"]) if not r.startswith("cap4d")}))')
+	$(PIP) install -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; o = p["optional-dependencies"]; print(*sorted({"".join(r.split()) for r in sum((o[e] for e in ("live", "capture", "track", "fit", "dev")), p["dependencies"]) if not r.startswith("cap4d")}))')
 	$(PIP) install --no-deps -c constraints.txt mediapipe
 	@touch $@
 

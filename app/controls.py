@@ -1,4 +1,4 @@
-"""What mouse and keyboard do to the view; knows no window system."""
+"""What mouse and keyboard do to the view and to what plays; knows no window system."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Callable
 from enum import Enum, auto
 
 from cap4d.app.orbit import Orbit
-from cap4d.app.play_clock import PlayClock
+
+MAX_SCROLL = 10.0  # steps that one event may turn the wheel
 
 
 class Drag(Enum):
@@ -17,24 +18,24 @@ class Drag(Enum):
 
 
 class Controls:
-    """The state behind the window's input.
+    """The state behind the window's input over the picture.
 
     Until the pointer first turns, zooms or pans, `orbit` is None and the camera follows the given path; reset
     gives it back to the path.
 
     Args:
-        clock: Paused, stepped and rewound by keys.
         current_orbit: The view shown now, from which a first move starts.
     """
 
-    def __init__(self, clock: PlayClock, current_orbit: Callable[[], Orbit]) -> None:
-        self.clock = clock
+    def __init__(self, current_orbit: Callable[[], Orbit]) -> None:
         self.current_orbit = current_orbit
         self.orbit: Orbit | None = None
-        self.shows_hud = True
-        self.quit = False
         self._drag: Drag | None = None
         self._pointer = (0.0, 0.0)
+
+    @property
+    def is_dragging(self) -> bool:
+        return self._drag is not None
 
     def press(self, drag: Drag) -> None:
         """A button went down."""
@@ -45,32 +46,27 @@ class Controls:
         self._drag = None
 
     def move(self, x: float, y: float, size: tuple[int, int]) -> None:
-        """The pointer is at (x, y) of a window of `size`, window units, y down."""
+        """The pointer is at (x, y) of a picture of `size`, window units, y down."""
         dx, dy = x - self._pointer[0], y - self._pointer[1]
         self._pointer = x, y
-        orbit = self.orbit or self.current_orbit()
         if self._drag is Drag.TURN:
-            self.orbit = orbit.turned(dx / size[1], dy / size[1])
+            self.orbit = self._seen().turned(dx / max(size[1], 1), dy / max(size[1], 1))
         elif self._drag is Drag.PAN:
-            self.orbit = orbit.panned(dx / min(size), dy / min(size))
+            side = max(min(size), 1)
+            self.orbit = self._seen().panned(dx / side, dy / side)
 
     def scroll(self, steps: float) -> None:
-        """The wheel turned away from the user by `steps`."""
-        self.orbit = (self.orbit or self.current_orbit()).zoomed(steps)
+        """The wheel turned away from the user by `steps`; a trackpad sends parts of them."""
+        self.orbit = self._seen().zoomed(min(max(steps, -MAX_SCROLL), MAX_SCROLL))
 
-    def key(self, name: str, now: float) -> None:
-        """A key went down: space, r, left, right, h, escape or q."""
-        match name:
-            case "space":
-                self.clock.toggle(now)
-            case "r":
-                self.orbit = None
-                self.clock.rewind(now)
-            case "left":
-                self.clock.step(-1)
-            case "right":
-                self.clock.step(1)
-            case "h":
-                self.shows_hud = not self.shows_hud
-            case "escape" | "q":
-                self.quit = True
+    def pan(self, right: float, down: float, size: tuple[int, int]) -> None:
+        """Two fingers moved the picture, window units."""
+        side = max(min(size), 1)
+        self.orbit = self._seen().panned(right / side, down / side)
+
+    def reset(self) -> None:
+        """Gives the camera back to its path."""
+        self.orbit = None
+
+    def _seen(self) -> Orbit:
+        return self.orbit or self.current_orbit()

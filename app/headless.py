@@ -1,23 +1,29 @@
-"""Playing without a window: every frame of the clip, into a file."""
+"""Playing without a window, into a file: every frame of a clip, or a live source while it lasts."""
 
 from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
 from cap4d.app.options import Options
+from cap4d.app.real_time import record_live
 
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
+from cap4d.drive.fillers import Fillers
+from cap4d.drive.open_live import is_live, open_live
 from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import Draw, Output, draw_on_cpu, pipeline_threads, render_to
 
 log = logging.getLogger(__name__)
+
+PICTURE = 512, 512  # px, where no size is asked for
 
 
 def play_headless(path: Path, options: Options) -> None:
@@ -27,19 +33,35 @@ def play_headless(path: Path, options: Options) -> None:
         ArgumentError, DataError: See `cap4d.player.offline.render_to`; `--pipeline` on another backend.
         GlUnavailableError: `--backend gl` without OpenGL 4.1.
     """
+    options = replace(options, size=options.size or PICTURE)
     threads = pipeline_threads() if options.pipeline else 0
     avatar = Avatar.load(path, deformer=options.deformer, threads=threads, deformer_budget_ms=math.inf)
+    if is_live(options.drive):
+        return _play_live_source(path, avatar, options)
     clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
     backend, draw = choose_backend(options.backend, avatar)
     if options.pipeline and backend != "cpu":
         raise ArgumentError(f"pipeline: expected the cpu backend, got {backend}")
     out = options.out or f"{path.stem}.mp4"
-    output = Output(out, frames=options.frames, size=options.size, stats=options.stats)
+    output = Output(out, frames=options.frames, size=options.size, stats=options.stats, audio=options.audio)
     pipelined = options.pipeline
-    stats = render_to(
-        avatar, clip, options.camera, output, draw=draw, backend=backend, pipelined=pipelined
-    )
+    stats = render_to(avatar, clip, options.camera, output, draw=draw, backend=backend, pipelined=pipelined)
     log.info("%s: %d frames, %.1f fps (%s)", out, stats["frames"], stats["fps"], backend)
+
+
+def _play_live_source(path: Path, avatar: Avatar, options: Options) -> None:
+    if options.pipeline:
+        raise ArgumentError(f"pipeline: expected a file to play, got {options.drive}, which comes live")
+    backend, draw = choose_backend(options.backend, avatar)
+    out, fillers = options.out or f"{path.stem}.mp4", Fillers(avatar.bundle)
+    with open_live(options.drive, avatar.bundle, template=options.template, fillers=fillers) as stream:
+        stats = record_live(avatar, stream, options, out, draw=draw, backend=backend)
+    drive = stats["drive"]
+    log.info(
+        "%s: %d frames, %.1f fps (%s); %d received, %d refused, latency %.0f ms (95 %%: %.0f ms)",
+        *(out, stats["frames"], stats["fps"], backend, drive["received"], sum(drive["rejected"].values())),
+        *(drive["latency_ms"]["median"], drive["latency_ms"]["p95"]),
+    )
 
 
 def choose_backend(wanted: str, avatar: Avatar) -> tuple[str, Draw]:

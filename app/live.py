@@ -1,36 +1,38 @@
-"""Playing in a window: the clip on the wall clock, the camera on the mouse."""
+"""Playing in a window: draws what is due, and the panels over it; sleeps while nothing changes."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections import deque
-from collections.abc import Iterable
+from collections.abc import Hashable
 from pathlib import Path
 
-import numpy as np
-from cap4d.app.controls import Controls
+import moderngl
+from cap4d.app.background import Backdrop, Background
+from cap4d.app.canvas import Canvas
 from cap4d.app.gl_context import is_software
-from cap4d.app.hud import Hud
+from cap4d.app.layout import Layout, share_out
+from cap4d.app.loading import load_avatar, open_playback
 from cap4d.app.options import Options
-from cap4d.app.orbit import Orbit
-from cap4d.app.play_clock import PlayClock
-from cap4d.app.renderers import WHITE, CpuRenderer, GlRenderer, Overlay, Renderer
+from cap4d.app.overlays.overlays import Overlays
+from cap4d.app.recent import RecentFiles, config_folder
+from cap4d.app.renderers import CpuRenderer, GlRenderer, Renderer
+from cap4d.app.shortcuts import Action
+from cap4d.app.sound import Sound
+from cap4d.app.taking import Taking
+from cap4d.app.viewer import Viewer
 from cap4d.app.window import Window
 
 from cap4d.camera import Camera
-from cap4d.drive.clip import Clip, Frame
-from cap4d.drive.source import open_source
 from cap4d.player.avatar import Avatar
-from cap4d.player.camera_path import CameraPath, camera_path, fitted
-from cap4d.player.offline import head_centre, statistics, write_stats
+from cap4d.player.offline import statistics, write_stats
 from cap4d.player.video import check_file
 
 log = logging.getLogger(__name__)
 
-STAGES = ("rig", "deform", "bind", "sort", "splat", "encode")
-READ_OUT_SECONDS = 0.5  # between changes of the numbers shown
 IDLE_SECONDS = 0.25  # the longest sleep of a window that shows nothing new
+BLINK_SECONDS = 0.1  # between pictures while a text field is open, whose cursor blinks
+LEFT_OVER = (0.095, 0.100, 0.113)  # behind the panels
 
 
 def play_live(path: Path, options: Options, window: Window) -> None:
@@ -41,154 +43,272 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     """
     if options.stats is not None:
         check_file(options.stats, "stats")
-    avatar = Avatar.load(path, deformer=options.deformer)
-    log.info("deformer: %s", avatar.tier)
-    clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
-    avatar.check_rig(clip.rig_name)
-    cameras = camera_path(options.camera, avatar.camera, head_centre(avatar), fps=clip.fps, size=None)
-    player = LivePlayer(window, choose_renderer(options.backend, window, avatar), avatar, clip, cameras)
+    viewer = open_viewer(path, options)
+    player = LivePlayer(window, viewer, options.backend)
     try:
         player.run(options.frames)
     finally:
-        player.hud.release()
+        player.close()
     if options.stats is not None:
         write_stats(options.stats, player.statistics())
 
 
-def choose_renderer(wanted: str, window: Window, avatar: Avatar) -> Renderer:
+def open_viewer(path: Path, options: Options) -> Viewer:
+    """What the command line asks for, ready to be shown.
+
+    Raises:
+        ArgumentError, DataError: See `play_live`.
+    """
+    loaded = load_avatar(path, options.deformer)
+    playback = open_playback(options.drive, loaded.bundle, template=options.template, fps=options.fps)
+    loaded.avatar.check_rig(playback.rig_name)
+    viewer = Viewer(
+        loaded,
+        playback,
+        camera=options.camera,
+        deformer=options.deformer,
+        recent=RecentFiles(config_folder() / "recent.json"),
+        is_welcome=options.avatar is None,
+    )
+    if options.avatar is not None:
+        viewer.recent.add(options.avatar)
+    if options.audio is not None:
+        viewer.set_sound(Sound.load(options.audio))
+    return viewer
+
+
+def choose_renderer(wanted: str, ctx: moderngl.Context, avatar: Avatar) -> Renderer:
     """`auto` is OpenGL unless a software driver stands behind it, which the CPU renderer beats."""
-    if wanted == "cpu" or (wanted == "auto" and is_software(window.ctx)):
-        return CpuRenderer(window.ctx, avatar)
-    return GlRenderer(window.ctx, avatar)
+    if wanted == "cpu" or (wanted == "auto" and is_software(ctx)):
+        return CpuRenderer(ctx, avatar)
+    return GlRenderer(ctx, avatar)
 
 
 class LivePlayer:
-    """One avatar and one clip in one window.
+    """A viewer in a window.
 
     Args:
         window: Where to draw.
-        renderer: How.
-        avatar: Whose stages are shown.
-        clip: What plays, again and again.
-        cameras: Where from, until the user takes the camera.
+        viewer: What.
+        backend: See `choose_renderer`.
     """
 
-    def __init__(
-        self, window: Window, renderer: Renderer, avatar: Avatar, clip: Clip, cameras: CameraPath
-    ) -> None:
-        self.window, self.renderer, self.avatar = window, renderer, avatar
-        self.clip, self.cameras = clip, cameras
-        self.centre = head_centre(avatar)
-        self.overlay = Overlay(window.ctx)
-        self.hud = Hud(window.ctx)
-        self.read_out = ReadOut()
-        self.clock = PlayClock(clip.fps, time.perf_counter())
-        self.controls = Controls(self.clock, self._orbit)
-        self.shown: tuple | None = None  # what the picture on screen depends on
+    def __init__(self, window: Window, viewer: Viewer, backend: str = "auto") -> None:
+        from cap4d.app.gui import Gui
+        from cap4d.app.input import Input
+        from cap4d.app.panels.screen import Screen
+
+        self.window, self.viewer, self.backend = window, viewer, backend
+        self.renderer = choose_renderer(backend, window.ctx, viewer.avatar)
+        self.backdrop, self.canvas = Backdrop(window.ctx), Canvas(window.ctx)
+        self.overlays = Overlays(window.ctx, viewer.avatar)
+        self.taking = Taking(viewer)
+        self.gui, self.screen = Gui(window.ctx, scale=window.scale, clipboard=window), Screen()
+        self.input = Input(self.gui, viewer)
+        self.picture: moderngl.Texture | None = None
+        self.camera: Camera | None = None  # of the picture
+        self.shown: Hashable = None  # what the picture on screen depends on
         self.frames = self.late = 0
-        self.started = time.perf_counter()
-        window.connect(self.controls)
+        self.started = self.swapped = viewer.now
+        viewer.display_hz = window.refresh_rate
+        window.connect(self.input)
 
     def run(self, frames: int | None) -> None:
         """Draws until the window closes, the user quits, or `frames` pictures were shown."""
-        while not (self.window.should_close or self.controls.quit or self.frames == frames):
+        while not (self.window.should_close or self.frames == frames):
             self.window.poll()
-            if not self._show():
-                self.window.wait(min(self.clock.due() - time.perf_counter(), IDLE_SECONDS))
+            if not self.step():
+                self.window.wait(self._pause())
+
+    def close(self) -> None:
+        """Ends what runs in the background, and Dear ImGui."""
+        self.taking.close()
+        self.viewer.close()
+        self.gui.release()
+
+    def step(self) -> bool:
+        """Shows what has changed; False if all of it is on screen already, or the window has no pixels."""
+        viewer = self.viewer
+        if viewer.poll():
+            self.gui.touch()
+        self._obey()
+        if min(self.window.framebuffer_size) < 1:
+            return False
+        layout, start = self._layout(), time.perf_counter()
+        is_new = self._draw_picture(layout)
+        if not (is_new or self.gui.is_moving or viewer.toasts.next_change(viewer.now) <= viewer.now):
+            return False
+        self._show(layout, is_new)
+        if is_new and self.renderer.name == "cpu":
+            viewer.quality.picture_took(time.perf_counter() - start, viewer.playback.interval)
+        self.window.swap()
+        if is_new:
+            self._count()
+        return True
 
     def statistics(self) -> dict:
         """What `--stats` writes."""
-        seconds = time.perf_counter() - self.started
-        return statistics(
-            self.avatar,
+        playback = self.viewer.playback
+        found = statistics(
+            self.viewer.avatar,
             self.frames,
-            seconds,
+            self.viewer.now - self.started,
             size=self.window.framebuffer_size,
             backend=self.renderer.name,
-            dropped=self.clock.dropped,
+            dropped=playback.dropped,
             late=self.late,
         )
+        return found | ({"drive": dict(playback.statistics())} if playback.is_live else {})
 
-    def _show(self) -> bool:
-        """Draws what is due; False if that is on screen already, or the window has no pixels."""
-        size = self.window.framebuffer_size
-        index = self.clock.index(time.perf_counter())
-        wanted = (index, self.controls.orbit, self.controls.shows_hud, size)
-        if wanted == self.shown or min(size) < 1:
+    def _layout(self) -> Layout:
+        viewer = self.viewer
+        layout = share_out(
+            self.window.size, self.gui.scale, panels=viewer.shows_panels, sidebar=viewer.shows_sidebar
+        )
+        self.input.picture_size = layout.picture.width, layout.picture.height
+        return layout
+
+    def _picture_size(self, layout: Layout) -> tuple[int, int]:
+        """The CPU draws the window's own units, however many pixels a display has to each, or fewer."""
+        if self.renderer.name == "cpu":
+            scale = self.viewer.quality.scale
+            return max(round(layout.picture.width * scale), 1), max(round(layout.picture.height * scale), 1)
+        *_, width, height = layout.picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        return max(width, 1), max(height, 1)
+
+    def _draw_picture(self, layout: Layout) -> bool:
+        """Draws the face if it is not the one on screen; an error is said, and the window goes on."""
+        viewer, size = self.viewer, self._picture_size(layout)
+        if viewer.is_settling and self.picture is not None:
             return False
-        start = time.perf_counter()
-        frame = self.clip.frame(index)
-        picture = self.renderer.texture(frame, self._camera(index, frame))
-        self.avatar.stages.add("frame", time.perf_counter() - start)
-        self.window.use()
-        self.overlay.draw(picture, WHITE, upright=True)
-        if self.controls.shows_hud:
-            self._draw_read_out(index)
-        self.window.swap()
-        self._count(wanted)
+        try:
+            wanted = viewer.number(), size
+            if wanted == self.shown:
+                return False
+            self.shown = wanted
+            self._render(size)
+        except Exception as error:  # of a source, or of an avatar: whatever it is, it costs a picture only
+            log.debug("no picture", exc_info=error)
+            viewer.fail(error)
+            return False
         return True
 
-    def _count(self, wanted: tuple) -> None:
+    def _render(self, size: tuple[int, int]) -> None:
+        viewer = self.viewer
+        self._follow_avatar()
+        start = time.perf_counter()
+        frame = viewer.frame()
+        if isinstance(self.renderer, CpuRenderer):
+            color = viewer.background
+            self.renderer.background = color if isinstance(color, tuple) else None
+        self.camera = viewer.camera(frame, size)
+        self.picture = self.renderer.texture(frame, self.camera)
+        viewer.avatar.stages.add("frame", time.perf_counter() - start)
+
+    def _follow_avatar(self) -> None:
+        """The renderer draws the viewer's avatar, which may have another deformer, or be another one."""
+        avatar, drawn = self.viewer.avatar, self.renderer.avatar
+        if avatar is drawn:
+            return
+        if avatar.bundle is drawn.bundle:
+            self.renderer.avatar = self.overlays.avatar = avatar
+        else:
+            self.overlays = Overlays(self.window.ctx, avatar)
+            self.picture = None
+            self.renderer = choose_renderer(self.backend, self.window.ctx, avatar)
+            self.window.set_title(f"{self.viewer.loaded.path.name} - cap4d-view")
+
+    def _show(self, layout: Layout, is_new: bool) -> None:
+        """Lays the picture and the panels out in the window."""
+        window, viewer = self.window, self.viewer
+        place = layout.picture.in_pixels(window.size, window.framebuffer_size)
+        canvas = self._draw_canvas(place[2:], is_new) if self.picture is not None else None
+        pixels = window.use()
+        window.ctx.clear(*LEFT_OVER)
+        if self.picture is not None:
+            window.ctx.viewport = place
+            self.backdrop.draw(canvas or self.picture, viewer.background, upright=True)
+            window.ctx.viewport = (0, 0, *pixels)
+        now, start = viewer.now, time.perf_counter()
+        self._draw_panels(layout, pixels, now)
+        viewer.avatar.stages.add("gui", time.perf_counter() - start)
+        window.show_cursor(self.gui.cursor())
+        window.ctx.gc()
+
+    def _draw_canvas(self, size: tuple[int, int], is_new: bool) -> moderngl.Texture | None:
+        """The picture with its overlays, if there are any; a recording gets what is new of it."""
+        viewer, recording = self.viewer, self.taking.recorder is not None and is_new
+        self.overlays.shown, self.overlays.part = set(viewer.overlays), viewer.overlay_part
+        if not (viewer.overlays or recording) or min(size) < 1:
+            return None
+        if is_new or self.canvas.texture is None or self.canvas.texture.size != size:
+            self._fill_canvas(viewer.background, size)
+        if recording:
+            self.taking.add(self.canvas.read())
+        return self.canvas.texture
+
+    def _fill_canvas(self, background: Background, size: tuple[int, int]) -> None:
+        drawn_by = {"overlays": self.overlays, "renderer": self.renderer, "camera": self.camera}
+        self.canvas.draw(self.picture, background, size, **drawn_by)
+
+    def _take_screenshot(self) -> None:
+        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        if self.picture is None or min(width, height) < 1:
+            return
+        background = self.taking.behind(self.viewer.background)
+        self._fill_canvas(background, (width, height))
+        self.taking.screenshot(self.canvas.read(), is_transparent=background is None)
+        self.canvas.texture = None  # another background than on screen
+
+    def _draw_panels(self, layout: Layout, pixels: tuple[int, int], now: float) -> None:
+        try:
+            with self.gui.frame(self.window.size, pixels, now - self.swapped):
+                self.screen.draw(self.viewer, layout, self.overlays.legends())
+        except Exception as error:  # a panel that fails costs this picture's panels
+            log.warning("panels: %s", error, exc_info=error)
+        self.swapped = now
+
+    def _count(self) -> None:
+        viewer = self.viewer
+        viewer.playback.shown(viewer.now)
+        viewer.timings.picture(viewer.avatar.stages, self.renderer.name, viewer.now)
+        if not viewer.loaded.is_settled:
+            viewer.settle()
+            return
         if self.frames == 0:
             self._start()
-        self.shown = wanted
         self.frames += 1
-        self.late += time.perf_counter() > self.clock.due()
-        self.read_out.tick(time.perf_counter())
-        self.window.ctx.gc()
+        self.late += viewer.now > viewer.playback.due()
 
     def _start(self) -> None:
         """Time counts from the first picture on, which loads what the others find loaded."""
-        self.avatar.stages.clear()
-        self.started = time.perf_counter()
-        self.clock.rewind(self.started)
+        log.info("deformer: %s", self.viewer.avatar.tier)
+        self.viewer.avatar.stages.clear()
+        self.started = self.viewer.now
+        self.viewer.playback.rewind(self.started)
 
-    def _camera(self, index: int, frame: Frame) -> Camera:
-        """The CPU draws the window's own units, however many pixels a display has to each."""
-        size = self.window.size if self.renderer.name == "cpu" else self.window.framebuffer_size
-        size = max(size[0], 1), max(size[1], 1)
-        if self.controls.orbit is not None:
-            return self.controls.orbit.camera(*size)
-        return fitted(self.cameras(index, frame), size)
+    def _pause(self) -> float:
+        """How long there is nothing to do, s."""
+        viewer, now = self.viewer, self.viewer.now
+        due = float("inf") if viewer.is_settling else viewer.playback.due() - now
+        toasts = viewer.toasts.next_change(now) - now
+        busy = BLINK_SECONDS / 5 if viewer.jobs.label is not None else IDLE_SECONDS
+        return min(due, toasts, busy)
 
-    def _orbit(self) -> Orbit:
-        """The view of the path at this moment, for the user to take over."""
-        index = self.clock.index(time.perf_counter())
-        return Orbit.from_camera(self.cameras(index, self.clip.frame(index)), self.centre)
+    def _toggle_recording(self) -> None:
+        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        self.taking.toggle_recording((width, height))
+        self.gui.touch()
 
-    def _draw_read_out(self, index: int) -> None:
-        lines = self.read_out.lines(self.avatar, self.renderer.name, time.perf_counter())
-        window, pixels = self.window.size, self.window.framebuffer_size
-        scale = pixels[0] / max(window[0], 1), pixels[1] / max(window[1], 1)
-        self.hud.draw([*lines, f"frame {index % len(self.clip) + 1} / {len(self.clip)}"], window, scale)
-
-
-class ReadOut:
-    """The numbers over the picture; they change twice a second, so that they can be read."""
-
-    def __init__(self) -> None:
-        self.times: deque[float] = deque(maxlen=120)  # of recent pictures
-        self.text: list[str] = []
-        self.written = -1e9
-
-    def tick(self, now: float) -> None:
-        """A picture was shown."""
-        self.times.append(now)
-
-    def fps(self) -> float:
-        """Pictures per second of the last two seconds."""
-        recent = [t for t in self.times if t > self.times[-1] - 2] if self.times else []
-        return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
-
-    def lines(self, avatar: Avatar, backend: str, now: float) -> list[str]:
-        """Frames per second, and the recent milliseconds of every stage."""
-        if now - self.written > READ_OUT_SECONDS:
-            self.written = now
-            seconds = avatar.stages.seconds
-            rows = [f"{name:7} {_recent_ms(seconds[name]):5.1f} ms" for name in STAGES if seconds.get(name)]
-            self.text = [f"{self.fps():.0f} fps  {backend}", *rows]
-        return self.text
-
-
-def _recent_ms(seconds: Iterable[float]) -> float:
-    return float(np.median(list(seconds)[-30:])) * 1e3
+    def _obey(self) -> None:
+        """Does what the user asked of the window itself."""
+        while self.viewer.asked:
+            match self.viewer.asked.popleft():
+                case Action.QUIT:
+                    self.window.close()
+                case Action.SCREENSHOT:
+                    self._take_screenshot()
+                case Action.RECORD:
+                    self._toggle_recording()
+                case Action.FULLSCREEN:
+                    self.window.toggle_fullscreen()

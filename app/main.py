@@ -14,6 +14,8 @@ from cap4d.errors import exit_code
 
 log = logging.getLogger(__name__)
 
+WINDOW = 1180, 760  # window units, where no size is asked for
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0 success, 1 bad data or no OpenGL, 2 a bad argument, 130 interrupted."""
@@ -34,7 +36,11 @@ def play(options: Options) -> None:
 
     avatar = options.avatar if options.avatar is not None else demo_avatar()
     read_manifest(avatar)  # before a window opens for what is no avatar
-    if options.headless or options.out is not None or not play_in_window(avatar, options):
+    if options.serve is not None:
+        from cap4d.app.serve.play import play_page
+
+        play_page(avatar, options)
+    elif options.headless or options.out is not None or not play_in_window(avatar, options):
         from cap4d.app.headless import play_headless
 
         play_headless(avatar, options)
@@ -45,7 +51,7 @@ def play_in_window(avatar: Path, options: Options) -> bool:
     from cap4d.app.window import DisplayUnavailableError, Window
 
     try:
-        window = Window(f"{avatar.name} - cap4d-view", *options.size)
+        window = Window(f"{avatar.name} - cap4d-view", *(options.size or WINDOW))
     except DisplayUnavailableError as error:
         log.info("%s; rendering offline instead", error)
         return False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cap4d.errors import ArgumentError
@@ -16,16 +16,25 @@ EXAMPLES = """examples:
   cap4d-view me.cap4d --drive speech.npy --template neutral.npy --fps 30
   cap4d-view me.cap4d --headless --frames 120 --out out.mp4 --stats stats.json
   cap4d-view me.cap4d --headless --camera orbit --out frame_%04d.png
+  cap4d-view me.cap4d --drive speech.npy --audio speech.wav --out speech.mp4
+  cap4d-view me.cap4d --serve                  a page for a browser on this machine
+  cap4d-view me.cap4d --serve 0.0.0.0:8300     for others too: to whom you give the address and its token
 
-keys: space pause, left/right step a frame, r reset, h read-out, q or escape quit
+keys: space pause, left/right step a frame, r reset the camera, h hide the panels, F1 all keys, q quit
 """
 
 
+DRIVE_HELP = (
+    "fit.npz or vertices .npy; or live: - (lines of JSON), tcp://, udp:// or ws://HOST:PORT, livelink://, "
+    "vmc://, webcam://0 (default: the avatar's idle clip)"
+)
 DEFORMERS = ("auto", "full", "fp16", "int8", "linear", "off")
+FPS_HELP = "frames per second of the source, whatever it says itself (live, headless: of the file)"
 DEFORMER_HELP = (
     "how the deformation network is evaluated, as far as the avatar has it (cap4d inspect); auto: the most "
     "exact, in a window the most exact that takes at most 8 ms a frame on this machine (default: auto)"
 )
+SERVE = "127.0.0.1:8300"
 
 
 @dataclass(frozen=True)
@@ -38,18 +47,24 @@ class Options:
     fps: float | None
     backend: str
     deformer: str
-    size: tuple[int, int]
+    size: tuple[int, int] | None
     headless: bool
     pipeline: bool
     frames: int | None
     out: str | None
     camera: str
+    audio: Path | None
     stats: Path | None
+    serve: str | None
+    token: str | None
 
 
 def parse_options(argv: Sequence[str] | None = None) -> Options:
     """Exits with code 2 and one line on a bad argument, with 0 after `--help`."""
-    return Options(**vars(build_parser().parse_args(argv)))
+    options = Options(**vars(build_parser().parse_args(argv)))
+    if options.avatar is None and options.serve is not None and ":" not in options.serve:
+        return replace(options, avatar=Path(options.serve), serve=SERVE)  # `--serve me.cap4d`
+    return options
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -61,17 +76,17 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("avatar", nargs="?", type=Path, metavar="AVATAR.cap4d", help="default: the built-in demo avatar")
-    add("--drive", metavar="SRC", help="fit.npz or vertices .npy (default: the avatar's idle clip)")
+    add("--drive", metavar="SRC", help=DRIVE_HELP)
     add(
         "--template",
         type=Path,
         metavar="FILE",
         help="neutral vertices for an .npy (.npy, .npz or .obj)",
     )
-    add("--fps", type=_rate, help="frames per second of the source, whatever it says itself")
+    add("--fps", type=_rate, help=FPS_HELP)
     add("--backend", choices=("auto", "gl", "cpu"), default="auto", help="auto: gl where there is a GPU")
     add("--deformer", choices=DEFORMERS, default="auto", help=DEFORMER_HELP)
-    add("--size", type=_size, default=(512, 512), metavar="WxH", help="picture, or window (default: 512x512)")
+    add("--size", type=_size, metavar="WxH", help="picture (default: 512x512), or window")
     add("--headless", action="store_true", help="no window: render to --out")
     add(
         "--pipeline",
@@ -83,7 +98,16 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add("--out", metavar="FILE", help="out.mp4, frame_%%04d.png or one.png (headless: default <avatar>.mp4)")
     add("--camera", default="static", metavar="static|orbit|FILE", help="camera path (default: static)")
+    add("--audio", type=Path, metavar="FILE.wav", help="sound that plays with the source, or of out.mp4")
     add("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
+    add(
+        "--serve",
+        nargs="?",
+        const=SERVE,
+        metavar="HOST:PORT",
+        help=f"no window: a page for browsers, with pictures of at most --size (default: {SERVE})",
+    )
+    add("--token", metavar="X", help="what --serve asks for (default: made up where others can reach it)")
     return parser
 
 

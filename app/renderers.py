@@ -6,21 +6,23 @@ from typing import Protocol
 
 import moderngl
 import numpy as np
-from cap4d.app.shader_source import build_program
+from cap4d.app.background import WHITE, Backdrop, Color
 from cap4d.app.splat_pass import BoundGaussians, SplatPass
 
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.player.avatar import Avatar
 
-Color = tuple[float, float, float]
-WHITE: Color = (1.0, 1.0, 1.0)
+Overlay = Backdrop  # its older name
 
 
 class Renderer(Protocol):
     """Draws one avatar."""
 
     name: str
+    avatar: Avatar
+    vertices: np.ndarray
+    """float32[G, 3] m: the posed grid of the last picture; the call after the next overwrites it."""
 
     def texture(self, frame: Frame, camera: Camera) -> moderngl.Texture:
         """The picture as a texture: premultiplied sRGB, row 0 on top. Valid until the next call."""
@@ -40,13 +42,14 @@ class GlRenderer:
     def __init__(self, ctx: moderngl.Context, avatar: Avatar) -> None:
         self.ctx, self.avatar = ctx, avatar
         self.splats = SplatPass(ctx, bound_gaussians(avatar))
-        self.overlay = Overlay(ctx)
+        self.overlay = Backdrop(ctx)
         self.target: moderngl.Framebuffer | None = None
+        self.vertices = np.zeros((0, 3), np.float32)
 
     def texture(self, frame: Frame, camera: Camera) -> moderngl.Texture:
         """See `Renderer`."""
         avatar, stages = self.avatar, self.avatar.stages
-        vertices = avatar.move(frame)
+        self.vertices = vertices = avatar.move(frame)
         order = avatar.splatter.order(camera.viewmat, vertices, avatar.threads)
         for stage in ("bind", "sort"):
             stages.add(stage, avatar.splatter.seconds[stage])
@@ -73,41 +76,26 @@ class CpuRenderer:
     Args:
         ctx: Any OpenGL context.
         avatar: Its `stages` receive the times.
-        background: The picture's.
+        background: A colour that is already behind the picture, which then is opaque; None: it is not.
     """
 
     name = "cpu"
 
-    def __init__(self, ctx: moderngl.Context, avatar: Avatar, background: Color = WHITE) -> None:
+    def __init__(self, ctx: moderngl.Context, avatar: Avatar, background: Color | None = WHITE) -> None:
         self.ctx, self.avatar, self.background = ctx, avatar, background
         self.picture: moderngl.Texture | None = None
+        self.vertices = np.zeros((0, 3), np.float32)
 
     def texture(self, frame: Frame, camera: Camera) -> moderngl.Texture:
         """See `Renderer`."""
-        image = self.avatar.draw(frame, camera, background=self.background)
+        self.vertices = self.avatar.move(frame)
+        image = self.avatar.splat(self.vertices, camera, background=self.background, alpha="premultiplied")
         size = camera.width, camera.height
         if self.picture is None or self.picture.size != size:
             self.picture = self.ctx.texture(size, 4)
             self.picture.repeat_x = self.picture.repeat_y = False
         self.picture.write(image)
         return self.picture
-
-
-class Overlay:
-    """Lays a premultiplied texture over a plain colour, filling the framebuffer in use."""
-
-    def __init__(self, ctx: moderngl.Context) -> None:
-        self.ctx = ctx
-        self.program = build_program(ctx, "present")
-        self.array = ctx.vertex_array(self.program, [])
-
-    def draw(self, picture: moderngl.Texture, background: Color, *, upright: bool = False) -> None:
-        """`upright`: for a window, whose row 0 is at the bottom; otherwise row 0 is the top row."""
-        self.ctx.enable_only(moderngl.NOTHING)
-        self.program["flip"] = (1, -1) if upright else (1, 1)
-        self.program["background"] = background
-        picture.use(0)
-        self.array.render(moderngl.TRIANGLES, vertices=3)
 
 
 def bound_gaussians(avatar: Avatar) -> BoundGaussians:

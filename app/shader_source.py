@@ -68,15 +68,18 @@ def build_program(
     name: str,
     constants: Mapping[str, Constant] | None = None,
     *,
+    vertex: str | None = None,
     varyings: Sequence[str] = (),
     read: Reader = read_package_shader,
 ) -> moderngl.Program:
     """Compiles `name.vert` with `name.frag`; when there are `varyings`, alone for transform feedback.
 
+    `vertex` names another vertex stage: one that several programs share.
+
     Raises:
         ShaderError: With the driver's message, positions as `file:line`.
     """
-    sources = {"vertex_shader": shader_source(f"{name}.vert", constants, read=read)}
+    sources = {"vertex_shader": shader_source(f"{vertex or name}.vert", constants, read=read)}
     if not varyings:
         sources["fragment_shader"] = shader_source(f"{name}.frag", constants, read=read)
     try:

@@ -18,6 +18,7 @@ from cap4d.bind import SAFE_NORM2
 from cap4d.camera import NEAR, Camera
 
 VERTEX_TEXTURE_WIDTH = 256  # texels; 65536 vertices make it square
+OUTPUTS = ("mean2d", "conic", "color_opacity", "axes")  # of project.vert
 PROJECTED_BYTES = 13 * 4  # mean2d 2, conic 3, colour and opacity 4, axes 4
 
 
@@ -71,23 +72,25 @@ class SplatPass:
 
     def __init__(self, ctx: moderngl.Context, gaussians: BoundGaussians, *, texture_type: str = "f4") -> None:
         self.ctx = ctx
-        self.count = len(gaussians)
+        self.gaussians = len(gaussians)
         self.texture_type = texture_type
         self.grid_vertices = _vertex_texture(ctx, gaussians.grid_size)
         self.picture: moderngl.Texture | None = None
         self.target: moderngl.Framebuffer | None = None
-        if self.count:
+        self._counts: moderngl.Texture | None = None
+        self._count_target: moderngl.Framebuffer | None = None
+        self._counting: moderngl.VertexArray | None = None
+        if self.gaussians:
             self._upload(gaussians)
 
     def _upload(self, gaussians: BoundGaussians) -> None:
         constants = render_constants() | {"SH_COUNT": gaussians.sh.shape[1], "SH_VEC4S": gaussians.sh_vec4s}
-        outputs = ("mean2d", "conic", "color_opacity", "axes")
-        self.project = build_program(self.ctx, "project", constants, varyings=outputs)
+        self.project = build_program(self.ctx, "project", constants, varyings=OUTPUTS)
         self.splat = build_program(self.ctx, "splat", constants)
         attributes = self.ctx.buffer(gaussians.attributes())
         triangles = self.ctx.buffer(np.ascontiguousarray(gaussians.triangles, np.uint32))
-        self.order = self.ctx.buffer(reserve=4 * self.count, dynamic=True)
-        self.projected = self.ctx.buffer(reserve=PROJECTED_BYTES * self.count)
+        self.order = self.ctx.buffer(reserve=4 * self.gaussians, dynamic=True)
+        self.projected = self.ctx.buffer(reserve=PROJECTED_BYTES * self.gaussians)
         names = ("mean_opacity", "quat", "log_scale", "sh")
         self.posing = self.ctx.vertex_array(
             self.project,
@@ -95,7 +98,7 @@ class SplatPass:
             index_buffer=self.order,
             index_element_size=4,
         )
-        self.drawing = self.ctx.vertex_array(self.splat, [(self.projected, "2f 3f 4f 4f/i", *outputs)])
+        self.drawing = self.ctx.vertex_array(self.splat, [(self.projected, "2f 3f 4f 4f/i", *OUTPUTS)])
 
     def draw(self, vertices: np.ndarray, order: np.ndarray, camera: Camera) -> moderngl.Texture:
         """Draws a frame.
@@ -110,10 +113,35 @@ class SplatPass:
         self._resize(camera.width, camera.height)
         self.target.use()
         self.target.clear()
-        if self.count:
+        if self.gaussians:
             self._project(vertices, order, camera)
             self._blend(camera)
         return self.picture
+
+    def count(self) -> moderngl.Texture:
+        """How many Gaussians each pixel of the last picture takes, hidden ones too: float32, row 0 on top.
+
+        Changes the framebuffer in use. Valid until the next call.
+        """
+        size = self.picture.size
+        if self._counts is None or self._counts.size != size:
+            self._counts = self.ctx.texture(size, 1, dtype="f4")
+            self._counts.repeat_x = self._counts.repeat_y = False
+            self._count_target = self.ctx.framebuffer(self._counts)
+        self._count_target.use()
+        self._count_target.clear()
+        if self.gaussians:
+            self._add_up(size)
+        return self._counts
+
+    def _add_up(self, size: tuple[int, int]) -> None:
+        if self._counting is None:
+            program = build_program(self.ctx, "count", render_constants(), vertex="splat")
+            self._counting = self.ctx.vertex_array(program, [(self.projected, "2f 3f 4f 4f/i", *OUTPUTS)])
+        self._counting.program["image_size"] = size
+        self.ctx.enable_only(moderngl.BLEND)
+        self.ctx.blend_func = moderngl.ONE, moderngl.ONE
+        self._counting.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=self.gaussians)
 
     def read(self) -> np.ndarray:
         """float32[H, W, 4] the picture, premultiplied."""
@@ -135,14 +163,14 @@ class SplatPass:
         self.grid_vertices.write(padded)
         self.order.write(np.ascontiguousarray(order[::-1], np.uint32))
         self.grid_vertices.use(0)
-        _set_camera(self.project, camera)
+        set_camera(self.project, camera)
         self.posing.transform(self.projected, moderngl.POINTS)
 
     def _blend(self, camera: Camera) -> None:
         self.splat["image_size"] = camera.width, camera.height
         self.ctx.enable_only(moderngl.BLEND)
         self.ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-        self.drawing.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=self.count)
+        self.drawing.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=self.gaussians)
 
 
 def render_constants() -> dict[str, Constant]:
@@ -165,7 +193,7 @@ def _vertex_texture(ctx: moderngl.Context, count: int) -> moderngl.Texture:
     return texture
 
 
-def _set_camera(program: moderngl.Program, camera: Camera) -> None:
+def set_camera(program: moderngl.Program, camera: Camera) -> None:
     """Only what the compiled program reads: a driver may drop the rest."""
     K = camera.K
     values = {

@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
-import time
+from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 import glfw
 import moderngl
-from cap4d.app.controls import Controls, Drag
 from cap4d.app.gl_context import GlUnavailableError, window_context
 
 from cap4d.errors import Cap4dError
 
-KEYS = {
-    glfw.KEY_SPACE: "space",
-    glfw.KEY_LEFT: "left",
-    glfw.KEY_RIGHT: "right",
-    glfw.KEY_ESCAPE: "escape",
-    glfw.KEY_R: "r",
-    glfw.KEY_H: "h",
-    glfw.KEY_Q: "q",
+KEY_NAMES = {
+    value: name.removeprefix("KEY_") for name, value in vars(glfw).items() if name.startswith("KEY_")
 }
-DRAGS = {
-    glfw.MOUSE_BUTTON_LEFT: Drag.TURN,
-    glfw.MOUSE_BUTTON_RIGHT: Drag.PAN,
-    glfw.MOUSE_BUTTON_MIDDLE: Drag.PAN,
-}
+"""glfw's number of a key -> its name: `SPACE`, `A`, `F1`."""
+
+
+class Listener(Protocol):
+    """Whom the window tells what happens to it. Positions are window units, y down."""
+
+    def pointer(self, x: float, y: float) -> None: ...
+
+    def button(self, button: int, down: bool, modifiers: int) -> None: ...
+
+    def wheel(self, dx: float, dy: float) -> None: ...
+
+    def key(self, key: int, action: int, modifiers: int) -> None: ...
+
+    def text(self, codepoint: int) -> None: ...
+
+    def focus(self, focused: bool) -> None: ...
+
+    def dropped(self, paths: list[Path]) -> None: ...
+
+    def damaged(self) -> None:
+        """What is on screen is lost, or has another size."""
 
 
 class DisplayUnavailableError(Cap4dError):
@@ -45,6 +56,8 @@ class Window:
 
     def __init__(self, title: str, width: int, height: int) -> None:
         self._last_error = ""
+        self._cursors: dict[int | None, object] = {}
+        self._windowed: tuple[int, int, int, int] | None = None  # place and size to go back to
         glfw.set_error_callback(self._on_error)
         if not glfw.init():
             raise DisplayUnavailableError(f"window: expected a display, found none ({self._last_error})")
@@ -85,6 +98,20 @@ class Window:
         return glfw.get_framebuffer_size(self.handle)
 
     @property
+    def scale(self) -> float:
+        """Window units per unit of design: above 1 where a dense display's pixels are the units."""
+        content, _ = glfw.get_window_content_scale(self.handle)
+        pixels = self.framebuffer_size[0] / max(self.size[0], 1)
+        return min(max(content / max(pixels, 1.0), 0.5), 4.0)
+
+    @property
+    def refresh_rate(self) -> float:
+        """Pictures a second that the display shows."""
+        monitor = glfw.get_primary_monitor()
+        mode = glfw.get_video_mode(monitor) if monitor else None
+        return float(mode.refresh_rate) if mode is not None and mode.refresh_rate > 0 else 60.0
+
+    @property
     def should_close(self) -> bool:
         return glfw.window_should_close(self.handle)
 
@@ -114,30 +141,62 @@ class Window:
         """Sleeps until there is input, at most `seconds`."""
         glfw.wait_events_timeout(max(seconds, 1e-4))
 
-    def connect(self, controls: Controls) -> None:
-        """Lets mouse and keyboard work `controls`."""
+    def connect(self, listener: Listener) -> None:
+        """Tells `listener` what mouse, keyboard and system do."""
         handle = self.handle
-        controls.move(*glfw.get_cursor_pos(handle), self._safe_size())
-        glfw.set_mouse_button_callback(handle, lambda _, *event: _press(controls, *event))
-        glfw.set_cursor_pos_callback(handle, lambda _, x, y: controls.move(x, y, self._safe_size()))
-        glfw.set_scroll_callback(handle, lambda _, dx, dy: controls.scroll(dy))
-        glfw.set_key_callback(handle, lambda _, *event: _key(controls, *event))
+        self._connected = listener
+        glfw.set_cursor_pos_callback(handle, lambda _, x, y: listener.pointer(x, y))
+        glfw.set_mouse_button_callback(
+            handle, lambda _, button, action, mods: listener.button(button, action == glfw.PRESS, mods)
+        )
+        glfw.set_scroll_callback(handle, lambda _, dx, dy: listener.wheel(dx, dy))
+        glfw.set_key_callback(handle, lambda _, key, code, action, mods: listener.key(key, action, mods))
+        glfw.set_char_callback(handle, lambda _, codepoint: listener.text(codepoint))
+        glfw.set_window_focus_callback(handle, lambda _, focused: listener.focus(bool(focused)))
+        glfw.set_drop_callback(handle, lambda _, paths: listener.dropped([Path(p) for p in paths]))
+        glfw.set_window_refresh_callback(handle, lambda _: listener.damaged())
+        glfw.set_framebuffer_size_callback(handle, lambda _, width, height: listener.damaged())
+        listener.pointer(*glfw.get_cursor_pos(handle))
 
-    def _safe_size(self) -> tuple[int, int]:
-        width, height = self.size
-        return max(width, 1), max(height, 1)
+    def copied(self) -> str:
+        """The text in the clipboard; empty where there is none."""
+        return (glfw.get_clipboard_string(self.handle) or b"").decode(errors="replace")
+
+    def copy(self, text: str) -> None:
+        """Puts text into the clipboard."""
+        glfw.set_clipboard_string(self.handle, text)
+
+    def show_cursor(self, shape: int | None) -> None:
+        """Gives the pointer one of glfw's shapes; None is the arrow."""
+        if shape not in self._cursors:
+            self._cursors[shape] = None if shape is None else glfw.create_standard_cursor(shape)
+        glfw.set_cursor(self.handle, self._cursors[shape])
+
+    def set_title(self, title: str) -> None:
+        glfw.set_window_title(self.handle, title)
+
+    def set_vsync(self, on: bool) -> None:
+        """Whether `swap` waits for the display."""
+        glfw.swap_interval(int(on))
+
+    def toggle_fullscreen(self) -> None:
+        """Between the whole display and the window as it was."""
+        if self._windowed is not None:
+            x, y, width, height = self._windowed
+            self._windowed = None
+            glfw.set_window_monitor(self.handle, None, x, y, width, height, glfw.DONT_CARE)
+            return
+        monitor = glfw.get_primary_monitor()
+        if monitor:
+            self._windowed = (*glfw.get_window_pos(self.handle), *self.size)
+            mode = glfw.get_video_mode(monitor)
+            glfw.set_window_monitor(
+                self.handle, monitor, 0, 0, mode.size.width, mode.size.height, mode.refresh_rate
+            )
+
+    def close(self) -> None:
+        """Asks the window to close."""
+        glfw.set_window_should_close(self.handle, True)
 
     def _on_error(self, code: int, description: bytes) -> None:
         self._last_error = description.decode(errors="replace")
-
-
-def _press(controls: Controls, button: int, action: int, modifiers: int) -> None:
-    if action == glfw.PRESS and button in DRAGS:
-        controls.press(Drag.PAN if modifiers & glfw.MOD_SHIFT else DRAGS[button])
-    elif action == glfw.RELEASE:
-        controls.release()
-
-
-def _key(controls: Controls, key: int, scancode: int, action: int, modifiers: int) -> None:
-    if action in (glfw.PRESS, glfw.REPEAT) and key in KEYS:
-        controls.key(KEYS[key], time.perf_counter())

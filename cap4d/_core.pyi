@@ -102,8 +102,19 @@ def rasterize_vjp(
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
     """Gradients of means, quats, scales, opacities, sh and means2d."""
 
+class _Unet:
+    def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:
+        """For a grid of `size` px. ValueError: a tensor is missing, or of a wrong dtype or shape."""
+    @property
+    def size(self) -> int: ...
+    def run(self, offsets: _F32, threads: int = 0, out: _F32 | None = None) -> _F32:
+        """offsets [3, S, S] m -> deformation [3, S, S] m, written into `out` if given.
+
+        ValueError: a number is not finite.
+        """
+
 @final
-class QuantizedUnet:
+class QuantizedUnet(_Unet):
     """The deformation network in 8-bit integers (`bundle.quantized_unet` has the tensors' meaning).
 
     The same bits for any thread count and on every instruction set. Calls from several threads wait for each
@@ -113,12 +124,16 @@ class QuantizedUnet:
     isa: ClassVar[Literal["base", "v3", "avxvnni", "v4", "vnni"]]
     """The variant of the inner loops in use."""
 
-    def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:
-        """For a grid of `size` px. ValueError: a tensor is missing, or of a wrong dtype or shape."""
-    @property
-    def size(self) -> int: ...
-    def run(self, offsets: _F32, threads: int = 0) -> _F32:
-        """offsets [3, S, S] m -> deformation [3, S, S] m. ValueError: a number is not finite."""
+@final
+class FloatUnet(_Unet):
+    """The deformation network in float32 (`bundle.float_unet` has the tensors' meaning).
+
+    The same bits for any thread count; instruction sets differ by rounding. Calls from several threads wait
+    for each other.
+    """
+
+    isa: ClassVar[Literal["base", "v3", "v4"]]
+    """The variant of the inner loops in use."""
 
 @final
 class Splatter:
@@ -145,8 +160,11 @@ class Splatter:
         background: tuple[float, ...] | None = None,
         vertices: _F32 | None = None,
         threads: int = 0,
+        premultiplied: bool = False,
     ) -> None:
-        """Into out uint8[H, W, 4]: on a background with alpha 255, or without one with straight alpha."""
+        """Into out uint8[H, W, 4]: on a background with alpha 255, else straight unless asked otherwise."""
+    def count(self, out: NDArray[np.uint16], threads: int = 0) -> None:
+        """Into out uint16[H, W]: how many Gaussians each pixel of the last picture takes, hidden ones too."""
     def render(
         self,
         viewmat: _F64,

@@ -32,6 +32,15 @@ enough to those of the full avatar in float64. The error is the squared error po
 idle clip, from the default view and around it, on black and on white. Steps learn from other frames than
 it is measured on."""
 
+DRIVE = """The viewer listens: cap4d-view me.cap4d --drive tcp://127.0.0.1:9000. It may come and go; the
+first frame waits for it. --impair makes the line worse, the same way for the same seed:
+
+  loss=5%        frames that never arrive
+  jitter=40ms    every frame is late by |x|, x normal with this deviation (at most 4 of them); in order
+  reorder[=5%]   frames overtake one another, and these are held back by one to three frames besides
+  duplicate=1%   arrive twice
+  garbage=1%     have a message before them that is no frame"""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
@@ -51,7 +60,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--version", action="version", version=f"cap4d {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for add in (add_demo, add_rig, add_track, add_fit, add_optimize, add_render, add_inspect, add_bench):
+    for add in (add_demo, add_rig, add_track, add_fit, add_optimize, add_render, add_drive):
+        add(commands)
+    for add in (add_inspect, add_bench):
         add(commands)
     return parser
 
@@ -439,6 +450,7 @@ def add_render(commands) -> None:
     parser.add_argument(
         "--pipeline", action="store_true", help="work out the next frame's face while a frame is drawn"
     )
+    parser.add_argument("--audio", type=Path, metavar="FILE.wav", help="the sound of out.mp4")
     parser.add_argument("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
 
 
@@ -458,7 +470,58 @@ def run_render(arguments: argparse.Namespace) -> None:
         stats=arguments.stats,
         deformer=arguments.deformer,
         pipelined=arguments.pipeline,
+        audio=arguments.audio,
     )
+
+
+def add_drive(commands) -> None:
+    parser = command(
+        commands,
+        "drive",
+        run_drive,
+        "send a source to a viewer, in real time",
+        "cap4d drive speech.npy --to tcp://127.0.0.1:9000 --impair loss=5%,jitter=40ms,reorder",
+        more=DRIVE,
+    )
+    parser.add_argument(
+        "source",
+        metavar="SRC",
+        help="fit.npz, vertices .npy, Live Link Face .csv, avatar.cap4d (its idle clip), - (NDJSON)",
+    )
+    parser.add_argument(
+        "--to", required=True, metavar="URL", help="tcp://, udp://, ws:// or livelink://HOST:PORT, or -"
+    )
+    parser.add_argument("--impair", metavar="LIST", help="make the line worse, see above")
+    parser.add_argument(
+        "--fps", type=float, metavar="N", help="frames per second of the source, whatever it says itself"
+    )
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="times as fast as recorded (default: 1)"
+    )
+    parser.add_argument("--loop", action="store_true", help="again and again, until Ctrl-C")
+    parser.add_argument(
+        "--as",
+        dest="form",
+        choices=("expr", "arkit", "vertices"),
+        help="how frames are said (default: as the file has them)",
+    )
+    parser.add_argument(
+        "--avatar", type=Path, metavar="AVATAR.cap4d", help="of the source's rig, to translate for --as"
+    )
+    parser.add_argument(
+        "--template", type=Path, metavar="FILE", help="neutral vertices of an .npy, to translate it"
+    )
+    parser.add_argument("--token", metavar="X", help="what the viewer asks for")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="same seed: the same frames suffer (default: 0)"
+    )
+
+
+def run_drive(arguments: argparse.Namespace) -> None:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the viewer
+    from cap4d.drive.send import Transmission, send
+
+    send(Transmission(**{name: value for name, value in vars(arguments).items() if name != "run"}))
 
 
 def add_inspect(commands) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from cap4d import __version__
+from cap4d.atomic import replacing
 from cap4d.errors import ArgumentError
 from cap4d.rig.head import HeadRig
 
@@ -20,6 +23,8 @@ log = logging.getLogger(__name__)
 
 SEED = 0
 VIEWS, FRAMES, SIZE = 11, 60, 256  # two of the views from behind, of nine in front the fifth looks straight
+DEMO_RECORD = "demo.json"  # in the cache folder: which code makes which avatar
+DEMO_NAME = re.compile(r"demo-[\w.-]+\.cap4d")
 EDITION = 2  # of the avatars made here: counts up when they come out otherwise from the same material
 
 
@@ -29,6 +34,9 @@ def demo_avatar_path() -> Path:
     Raises:
         ModuleNotFoundError: It is not there yet and the packages that fit avatars are not installed.
     """
+    known = remembered_demo()
+    if known is not None:
+        return known
     from cap4d.rig.builtin import build_head
 
     rig = build_head()
@@ -36,7 +44,41 @@ def demo_avatar_path() -> Path:
     path = cache_folder() / f"demo-{__version__}-{key}.cap4d"
     if not path.exists():
         build_demo_avatar(rig, path)
+    remember_demo(path)
     return path
+
+
+def remembered_demo() -> Path | None:
+    """The demo's avatar, if it is known which one this code makes: building the head to find out takes most of
+    a second.
+    """
+    try:
+        code, name = json.loads((cache_folder() / DEMO_RECORD).read_text("utf-8")[:1000])
+    except (OSError, ValueError, TypeError):
+        return None
+    if code != code_fingerprint() or not isinstance(name, str) or not DEMO_NAME.fullmatch(name):
+        return None
+    path = cache_folder() / name
+    return path if path.is_file() else None
+
+
+def remember_demo(path: Path) -> None:
+    """Notes which avatar this code makes."""
+    try:
+        with replacing(cache_folder() / DEMO_RECORD) as temporary:
+            temporary.write_text(json.dumps([code_fingerprint(), path.name]))
+    except (ArgumentError, OSError) as error:
+        log.debug("%s is looked for anew each time: %s", path, error)
+
+
+def code_fingerprint() -> str:
+    """Changes with any line of code that can change the built-in head, and with NumPy."""
+    here = Path(__file__).parent
+    files = sorted([*here.glob("*.py"), *(here / "rig").rglob("*.py")])
+    digest = hashlib.sha256(repr((fingerprint(VIEWS, FRAMES, SIZE), np.__version__)).encode())
+    for file in files:
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def build_demo_avatar(rig: HeadRig, path: Path) -> None:

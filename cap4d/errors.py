@@ -8,6 +8,7 @@ from pathlib import Path
 
 EXTRAS = {
     **dict.fromkeys(("cv2", "mediapipe"), "pip install 'cap4d[track]'"),
+    "websockets": "pip install 'cap4d[live]'",
     **dict.fromkeys(("onnx", "onnxscript"), "pip install 'cap4d[fit]'"),
     **dict.fromkeys(
         ("torch", "OpenImageIO", "trimesh", "scipy"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from cap4d.errors import ArgumentError
 
+HALF = ".float16"  # the name of a rounded tensor: the original's with this behind it
 MIN_VALUES = 256  # smaller tensors (biases of a few channels, shapes, scalars) are not worth a node
 
 
@@ -37,8 +38,8 @@ def halve_weights(model: bytes) -> bytes:
                 f"{tensor.name}: expected weights within float16's range, got {np.abs(values).max():g}"
             )
         name = tensor.name
-        tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}.float16"))
-        casts.append(onnx.helper.make_node("Cast", [f"{name}.float16"], [name], to=onnx.TensorProto.FLOAT))
+        tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}{HALF}"))
+        casts.append(onnx.helper.make_node("Cast", [f"{name}{HALF}"], [name], to=onnx.TensorProto.FLOAT))
     nodes = list(proto.graph.node)
     del proto.graph.node[:]
     proto.graph.node.extend(casts + nodes)

@@ -14,13 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cap4d.bundle.unet_graph import Attribute, Node
 from cap4d.errors import DataError
 
 MAX_BYTES = 512 << 20
 MAX_NODES, MAX_TENSORS, MAX_DIMS, MAX_FIELDS = 2048, 2048, 8, 1 << 16
 MIN_OPSET, MAX_OPSET = 13, 26
-FLOAT, FLOAT16 = 1, 10
-ITEM_BYTES = {FLOAT: 4, 2: 1, 3: 1, 6: 4, 7: 8, 9: 1, FLOAT16: 2}  # + uint8, int8, int32, int64, bool
+FLOAT, INT64, FLOAT16 = 1, 7, 10
+ITEM_BYTES = {FLOAT: 4, 2: 1, 3: 1, 6: 4, INT64: 8, 9: 1, FLOAT16: 2}  # + uint8, int8, int32, bool
 
 # What a network on images is made of. No control flow, no random numbers, no files, strings or sequences, and
 # nothing whose output size is a number in the file (Tile, Range, ConstantOfShape, Resize).
@@ -70,6 +71,46 @@ def stores_half(data: bytes) -> bool:
     graph = _message(model[7][0], "GraphProto", {1, 2, 5, 10, 11, 12, 13, 16})
     tensors = (_message(t, "TensorProto", {1, 2, 8, 9, 12, 14, 16}) for t in graph[5])
     return any(tensor[2][-1:] == [FLOAT16] for tensor in tensors)
+
+
+def read_graph(data: bytes) -> tuple[list[Node], dict[str, np.ndarray]] | None:
+    """The nodes of a scanned network in order, and its initialisers by name, as they are stored.
+
+    None where it has what these cannot say: several outputs of a node, attributes other than numbers, tensors
+    other than float32, float16 and int64, or one name twice. The arrays lie in `data`, aligned or not.
+    """
+    try:
+        model = _message(memoryview(data), "ModelProto", {1, 2, 3, 4, 5, 6, 7, 8, 14})
+        graph = _message(model[7][0], "GraphProto", {1, 2, 5, 10, 11, 12, 13, 16})
+        nodes = [_node(node) for node in graph[1]]
+        tensors = [_tensor(tensor) for tensor in graph[5]]
+    except (_Malformed, IndexError, KeyError, ValueError):
+        return None
+    return (nodes, dict(tensors)) if len(dict(tensors)) == len(tensors) else None
+
+
+def _node(data: memoryview) -> Node:
+    node = _message(data, "NodeProto", {1, 2, 3, 4, 5, 7})
+    (output,), (operator,) = node[2], node[4]
+    attributes = dict(_attribute(attribute) for attribute in node[5])
+    return Node(_text(operator), tuple(_text(name) for name in node[1]), _text(output), attributes)
+
+
+def _attribute(data: memoryview) -> tuple[str, Attribute]:
+    attribute = _message(data, "AttributeProto", {1, 2, 3, 8, 20}, fixed32={2})
+    (name,), (kind,) = attribute[1], attribute[20]
+    numbers = {1: attribute[2], 2: attribute[3], 7: attribute[8]}[kind]
+    if kind == 7:
+        return _text(name), _integers(numbers, "attribute.ints")
+    (number,) = numbers
+    return _text(name), np.frombuffer(number, "<f4")[0] if kind == 1 else number
+
+
+def _tensor(data: memoryview) -> tuple[str, np.ndarray]:
+    tensor = _message(data, "TensorProto", {1, 2, 8, 9, 12, 14, 16})
+    dtype = {FLOAT: "<f4", FLOAT16: "<f2", INT64: "<i8"}[tensor[2][-1]]
+    (name,), (raw,) = tensor[8], tensor[9]
+    return _text(name), np.frombuffer(raw, dtype).reshape(_integers(tensor[1], "tensor.dims"))
 
 
 def _scan_model(data: memoryview, size: int) -> OnnxSummary:

@@ -28,7 +28,26 @@ def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
     """
     arrays = read_npz(path, names=FIELDS)
     _check_rig(path, arrays, bundle)
-    expr = checked_float32(path, "expr", arrays.get("expr"), shape=(None, bundle.n_expressions))
+    return _clip(path, arrays, bundle.rig_name, bundle.n_expressions, fps)
+
+
+def read_sequence(path: Path, *, fps: float | None = None) -> Clip:
+    """The same for no avatar in particular: of the rig that the file names, or FLAME's.
+
+    Raises:
+        DataError: Not sound.
+    """
+    arrays = read_npz(path, names=FIELDS)
+    name = RELEASED_RIG
+    if "rig_name" in arrays:
+        name = str(checked(path, "rig_name", arrays["rig_name"], kind="text", shape=()))
+    return _clip(path, arrays, name, None, fps)
+
+
+def _clip(
+    path: Path, arrays: dict[str, np.ndarray], rig_name: str, n_expressions: int | None, fps: float | None
+) -> Clip:
+    expr = checked_float32(path, "expr", arrays.get("expr"), shape=(None, n_expressions))
     frames = len(expr)
     if not 1 <= frames <= MAX_FRAMES:
         raise DataError(path, "expr", expected=f"1 to {MAX_FRAMES} frames", found=frames)
@@ -37,7 +56,7 @@ def read_fit(path: Path, bundle: Bundle, *, fps: float | None = None) -> Clip:
     pose = {name: None for name in ("rot", "tra") if not {"rot", "tra"} <= arrays.keys()}
     for name in {"eye_rot", "neck_rot", "jaw_rot", "rot", "tra"} - turns.keys() - pose.keys():
         turns[name] = checked_float32(path, name, arrays.get(name), shape=(frames, 3))
-    return Clip(bundle.rig_name, fps or _fps(path, arrays), expr, **turns, **pose)
+    return Clip(rig_name, fps or _fps(path, arrays), expr, **turns, **pose)
 
 
 def _check_rig(path: Path, arrays: dict[str, np.ndarray], bundle: Bundle) -> None:

@@ -26,6 +26,7 @@ class Cause(StrEnum):
     TOKEN = "token"  # the sender did not give the right one
     SENDER = "sender"  # an address that may not send, or one too many
     RETARGET = "retarget"  # vertices that are no face
+    INTERNAL = "internal"  # a fault of ours; the log says which
 
 
 class Rejected(Exception):
@@ -70,11 +71,15 @@ class Packet:
 class Sink(Protocol):
     """Where receivers put what comes. Any thread may call it; it neither blocks nor raises."""
 
-    def packet(self, packet: Packet, arrival: float) -> None:
-        """A sound frame; `arrival` in seconds of `time.monotonic`."""
+    def packet(self, packet: Packet, arrival: float) -> bool:
+        """A sound frame; `arrival` in seconds of `time.monotonic`.
 
-    def rejected(self, cause: Cause, detail: str = "") -> None:
-        """A frame that was refused."""
+        Returns:
+            Whether it was one for this avatar: a sender who sends no such frame does not keep others out.
+        """
+
+    def rejected(self, cause: Cause, detail: str = "", *, times: int = 1) -> None:
+        """A frame that was refused, or so many."""
 
 
 class Receiver(Protocol):

@@ -65,12 +65,12 @@ class Retargeter:
             )
         self._vertices, self._bary = grid.vertices[still], grid.bary[still]
         self._subject = _points_of(subject, still)
-        self._basis = self._subject.expression_basis.reshape(bundle.n_expressions, -1)
+        self._basis = _by_axis(self._subject.expression_basis).reshape(bundle.n_expressions, -1)
         normal = self._basis.astype(np.float64) @ self._basis.T.astype(np.float64)
         normal += noise**2 * np.eye(len(normal))
         self._expr_from_motion = np.linalg.solve(normal, self._basis.astype(np.float64)).astype(np.float32)
         self._eyes = [
-            _EyePoints(grid.vertices[points], grid.bary[points], subject.expression_basis[:, points])
+            _EyePoints.of(grid.vertices[points], grid.bary[points], subject.expression_basis[:, points])
             for points in _eyeballs(subject.joint_drivers, subject.skin_weights, covered)
         ]
 
@@ -86,15 +86,15 @@ class Retargeter:
         return Retargeted(self.rig_name, expr, eye_rot, residual)
 
     def _chunk(self, vertices: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        motion = _mix(vertices - template, self._vertices, self._bary).reshape(len(vertices), -1)
+        motion = _mix(vertices - template, self._vertices, self._bary).reshape(len(vertices), -1)  # by axis
         expr = motion @ self._expr_from_motion.T
         eye_rot = self._gaze(vertices, template, expr)
         if eye_rot.any():  # lids follow the eyes without an expression: take that motion away and solve again
             with_gaze, without = self._subject.pose(expr, eye_rot=eye_rot), self._subject.pose(expr)
-            motion = motion - (with_gaze - without).reshape(motion.shape)
+            motion = motion - _by_axis(with_gaze - without).reshape(motion.shape)
             expr = motion @ self._expr_from_motion.T
-        left = (motion - expr @ self._basis).reshape(len(vertices), -1, 3)
-        return expr, eye_rot, 1e3 * np.sqrt((left**2).sum(-1).mean(-1))
+        left = motion - expr @ self._basis
+        return expr, eye_rot, 1e3 * np.sqrt(3 * np.einsum("ti,ti->t", left, left) / left.shape[1])
 
     def _gaze(self, vertices: np.ndarray, template: np.ndarray, expr: np.ndarray) -> np.ndarray:
         """[T, 3] the rotation that both eyeballs share (fact 5): Kabsch, about each one's own centre."""
@@ -103,8 +103,8 @@ class Retargeter:
         covariance = np.zeros((len(vertices), 3, 3))
         for eye in self._eyes:
             posed, straight = _mix(vertices, eye.vertices, eye.bary), _mix(template, eye.vertices, eye.bary)
-            straight = straight + np.tensordot(expr, eye.basis, 1)
-            covariance += _centred(posed).swapaxes(-1, -2) @ _centred(straight)
+            straight = straight + (expr @ eye.basis).reshape(posed.shape)
+            covariance += _centred(posed) @ _centred(straight).swapaxes(-1, -2)
         u, _, vt = np.linalg.svd(covariance)
         u[..., 2] *= np.linalg.det(u @ vt)[:, None]
         eye_rot = rotmat_to_axis_angle(u @ vt)
@@ -115,9 +115,15 @@ class Retargeter:
 
 @dataclass(frozen=True, eq=False)
 class _EyePoints:
+    """The points of an eyeball as mixtures of the mesh's; `basis` [E, 3 P] by axis."""
+
     vertices: np.ndarray
     bary: np.ndarray
     basis: np.ndarray
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, bary: np.ndarray, basis: np.ndarray) -> _EyePoints:
+        return cls(vertices, bary, _by_axis(basis).reshape(len(basis), -1))
 
 
 def _points_of(subject: Subject, mask: np.ndarray) -> Subject:
@@ -138,9 +144,15 @@ def _eyeballs(drivers: tuple[str, ...], weights: np.ndarray, covered: np.ndarray
 
 
 def _centred(points: np.ndarray) -> np.ndarray:
-    return points.astype(np.float64) - points.mean(-2, keepdims=True, dtype=np.float64)
+    return points.astype(np.float64) - points.mean(-1, keepdims=True, dtype=np.float64)
+
+
+def _by_axis(points: np.ndarray) -> np.ndarray:
+    """[..., P, 3] -> contiguous [..., 3, P]: all x, all y, all z. Mixing runs several times faster on it."""
+    return np.ascontiguousarray(points.swapaxes(-1, -2))
 
 
 def _mix(values: np.ndarray, vertices: np.ndarray, bary: np.ndarray) -> np.ndarray:
-    """[..., V, 3] -> [..., P, 3]"""
-    return sum(values[..., vertices[:, corner], :] * bary[:, corner, None] for corner in range(3))
+    """[..., V, 3] -> [..., 3, P]"""
+    values = _by_axis(values)
+    return sum(values.take(vertices[:, corner], axis=-1) * bary[:, corner] for corner in range(3))

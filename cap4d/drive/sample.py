@@ -28,13 +28,12 @@ def sample(clip: Clip, t: float) -> Frame:
     values = {}
     for name in ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra"):
         value = getattr(clip, name)
-        values[name] = (
-            None if value is None else _between(value[here], value[there], blend, cut=name in TURNS)
-        )
+        values[name] = None if value is None else between(value[here], value[there], blend, cut=name in TURNS)
     return Frame(t, clip.rig_name, **values)
 
 
-def _between(a: np.ndarray, b: np.ndarray, blend: float, *, cut: bool) -> np.ndarray:
+def between(a: np.ndarray, b: np.ndarray, blend: float, *, cut: bool) -> np.ndarray:
+    """Linear from `a` to `b`; with `cut`, a jump of more than `MAX_TURN` stays one."""
     if cut and np.linalg.norm(b - a) > MAX_TURN:
         return a if blend < 0.5 else b
     return (a + np.float32(blend) * (b - a)).astype(np.float32)

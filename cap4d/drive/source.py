@@ -9,13 +9,14 @@ from pathlib import Path
 from cap4d.bundle.bundle import Bundle
 from cap4d.drive.clip import Clip
 from cap4d.drive.fit import read_fit
+from cap4d.drive.livelink_csv import read_livelink_csv
 from cap4d.drive.retarget import Retargeter
 from cap4d.drive.vertices import VERTEX_FPS, expected_vertices, read_template, read_vertices
 from cap4d.errors import ArgumentError
 
 log = logging.getLogger(__name__)
 
-SOURCES = "a fit.npz, or vertices in an .npy"
+SOURCES = "a fit.npz, vertices in an .npy, or a Live Link Face recording, .csv"
 
 
 def open_source(
@@ -25,7 +26,7 @@ def open_source(
 
     Args:
         spec: None, the avatar's idle clip; `*.npz`, a FlowFace sequence (facts 41, 46); `*.npy`, vertices as
-            CodeTalker and VOCA write them.
+            CodeTalker and VOCA write them; `*.csv`, a recording of Live Link Face.
         bundle: The avatar.
         template: Neutral vertices of an `.npy`: `.npy`, `.npz` with key `template`, or `.obj`; without it the
             first frame is taken for neutral.
@@ -44,6 +45,8 @@ def open_source(
     path = Path(spec)
     if path.suffix == ".npz":
         return read_fit(path, bundle, fps=fps)
+    if path.suffix == ".csv":
+        return read_livelink_csv(path, bundle, fps=fps)
     if path.suffix == ".npy":
         return _vertex_clip(path, bundle, template, fps)
     raise ArgumentError(f"drive: expected {SOURCES}, got {spec}")

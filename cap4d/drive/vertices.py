@@ -22,14 +22,16 @@ def expected_vertices(bundle: Bundle) -> int:
     return FLAME_VERTICES if bundle.rig_name.startswith("flame") else bundle.rig_vertices
 
 
-def read_vertices(path: Path, count: int) -> np.ndarray:
-    """float32[T, count, 3] m from an .npy of [T, 3 count] or [T, count, 3].
+def read_vertices(path: Path, count: int | None) -> np.ndarray:
+    """float32[T, count, 3] m from an .npy of [T, 3 count] or [T, count, 3]; None: of any count.
 
     Raises:
         DataError: Not sound, or of another topology.
     """
     value = _numbers(path, "vertices", read_npy(path))
     per_frame = value.shape[1] if value.ndim == 2 else value.shape[1] * 3 if value.ndim == 3 else 0
+    if count is None:
+        count = max(per_frame // 3, 1)
     if per_frame != 3 * count or (value.ndim == 3 and value.shape[2] != 3):
         other = " (BIWI's mesh, which is not FLAME's)" if per_frame == 3 * BIWI_VERTICES else ""
         expected = f"[T, {3 * count}] or [T, {count}, 3]"

@@ -17,7 +17,9 @@ import torch
 from onnx import numpy_helper
 from torch.nn import functional
 
+from cap4d.bundle.float_unet import first_layer
 from cap4d.bundle.quantized_unet import SMALLEST_SCALE, check_quantized, depth
+from cap4d.bundle.unet_graph import layer_names
 
 LEAK = 0.2
 NORM_EPS = 1e-5
@@ -38,7 +40,7 @@ def quantize(onnx_model: bytes, offsets: np.ndarray) -> dict[str, np.ndarray]:
     """
     net = _FloatNet.load(onnx_model)
     ranges = net.ranges(torch.from_numpy(np.ascontiguousarray(offsets, np.float32)))
-    tensors = {"mask": net.mask.astype(np.uint8), **net.first_layer()}
+    tensors = {"mask": net.mask.astype(np.uint8), **net.first_layer}
     inputs: dict[str, np.ndarray] = {}
     for i in range(net.depth):
         if i > 0:
@@ -75,6 +77,7 @@ class _FloatNet:
     per_metre: np.float32
     metres: np.float32
     encoding: torch.Tensor
+    first_layer: dict[str, np.ndarray]
     down: list[tuple[np.ndarray, np.ndarray]]
     up: list[tuple[np.ndarray, np.ndarray]]
 
@@ -86,40 +89,17 @@ class _FloatNet:
         size = len(scale)
         rows, columns = (torch.from_numpy(values[name].copy()) for name in ("rows", "columns"))
         plane = (-1, -1, size, size)
-        down, up, prefix = [], [], "model"
-        for i in range(depth(size)):
-            first, last = (0, 3) if i == 0 else (1, 3 if i == depth(size) - 1 else 5)
-            for layers, index in ((down, first), (up, last)):
-                name = f"{prefix}.model.{index}"
-                layers.append((values[f"{name}.weight"], values[f"{name}.bias"]))
-            prefix = f"{prefix}.model.{1 if i == 0 else 3}"
+        down, up = (
+            [(values[f"{name}.weight"], values[f"{name}.bias"]) for name in names]
+            for names in zip(*layer_names(depth(size)), strict=True)
+        )
         encoding = torch.cat([rows.expand(plane), columns.expand(plane)], 1)
-        return cls(size, scale > 0, scale.max(), values["metres"], encoding, down, up)
+        tables = first_layer(values)
+        return cls(size, scale > 0, scale.max(), values["metres"], encoding, tables, down, up)
 
     @property
     def depth(self) -> int:
         return len(self.down)
-
-    def first_layer(self) -> dict[str, np.ndarray]:
-        """The first layer with its constant inputs summed up. They depend on the row, or on the column, but
-        at the border, where a column, or a row, of the kernel hangs over.
-        """
-        weight, bias = (torch.from_numpy(x.astype(np.float64)) for x in self.down[0])
-        half = self.encoding.shape[1] // 2
-        rows, columns = (
-            functional.conv2d(part.double(), kernel, stride=2, padding=1)[0]
-            for part, kernel in (
-                (self.encoding[:, :half], weight[:, 3 : 3 + half]),
-                (self.encoding[:, half:], weight[:, 3 + half :]),
-            )
-        )
-        rows = rows[:, :, [0, 1, -1]] + bias[:, None, None]
-        tables = {
-            "down0.weight": weight[:, :3] * float(self.per_metre),
-            "down0.rows": rows.permute(2, 1, 0),
-            "down0.columns": columns[:, [0, 1, -1], :].permute(1, 2, 0),
-        }
-        return {name: np.ascontiguousarray(value.numpy(), np.float32) for name, value in tables.items()}
 
     def ranges(self, offsets: torch.Tensor) -> dict[str, Range]:
         """Of what each layer hands to its activation, over offsets [B, 3, S, S]."""

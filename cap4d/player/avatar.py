@@ -20,6 +20,7 @@ from cap4d.player.surface import Surface
 from cap4d.player.tiers import BUDGET_MS, choose_tier, moving_subject
 
 Tier = Literal["auto", "full", "fp16", "int8", "linear", "off"]
+Alpha = Literal["straight", "premultiplied"]
 
 
 class Avatar:
@@ -120,6 +121,13 @@ class Avatar:
         self._pose(out, expr, eye_rot=eye_rot, neck_rot=neck_rot, jaw_rot=jaw_rot)
         return out
 
+    def deformation(self) -> np.ndarray:
+        """float32[G, 3] m, OpenCV axes: how far the deformer moved the grid's vertices in the last frame.
+
+        Worked out when asked for; `bundle.deform_neutral` is the part of it that is there without expression.
+        """
+        return self.surface.deformation()
+
     def move(self, frame: Frame) -> np.ndarray:
         """`vertices` of a driven frame, in the avatar's own memory: the call after the next overwrites it."""
         self.check_rig(frame.rig_name)
@@ -174,19 +182,24 @@ class Avatar:
         *,
         background: tuple[float, float, float] | None = None,
         out: np.ndarray | None = None,
+        alpha: Alpha = "straight",
     ) -> np.ndarray:
         """The picture of posed vertices; see `render`.
 
         Args:
             vertices: float32[G, 3] as of `vertices`.
             out: uint8[H, W, 4] to draw into, so that nothing is allocated; None makes one.
+            alpha: What a picture without a background has; with one it is opaque.
         """
         if out is None:
             out = np.empty((camera.height, camera.width, 4), np.uint8)
         elif out.shape != (camera.height, camera.width, 4):
             found = list(out.shape)
             raise ArgumentError(f"out: expected uint8[{camera.height}, {camera.width}, 4], got {found}")
-        self.splatter.draw(out, camera.viewmat, camera.K, background, vertices, self.threads)
+        premultiplied = background is None and alpha == "premultiplied"
+        self.splatter.draw(
+            out, camera.viewmat, camera.K, background, vertices, self.threads, premultiplied=premultiplied
+        )
         parts = self.splatter.seconds
         self.stages.add("bind", parts.pop("bind"))
         self.stages.add("splat", sum(parts.values()))

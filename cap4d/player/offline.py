@@ -24,6 +24,7 @@ from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar, Tier
 from cap4d.player.camera_path import CameraPath, camera_path
 from cap4d.player.deformer import default_threads
+from cap4d.player.sound import Sound
 from cap4d.player.stages import peak_memory_mb
 from cap4d.player.video import MAX_SIDE, VideoWriter, check_file, check_output
 
@@ -47,6 +48,7 @@ class Output:
         fps: Of the pictures; None is the clip's own.
         size: (width, height) px; None is the camera's.
         stats: JSON file for the times, or None.
+        audio: The sound of an mp4, a .wav, or None; it starts with the first picture and ends with the last.
     """
 
     path: str | Path | None
@@ -54,6 +56,7 @@ class Output:
     fps: float | None = None
     size: tuple[int, int] | None = None
     stats: Path | None = None
+    audio: Path | None = None
 
 
 def draw_on_cpu(avatar: Avatar, frame: Frame, camera: Camera) -> np.ndarray:
@@ -164,12 +167,14 @@ def render_to(
     path = camera_path(camera, avatar.camera, head_centre(avatar), fps=fps, size=output.size)
     if output.path is not None:
         view = path(0, clip.frame(0))
-        check_output(Path(output.path), fps=fps, frames=total, size=(view.width, view.height))
+        size, sounds = (view.width, view.height), output.audio is not None
+        check_output(Path(output.path), fps=fps, frames=total, size=size, sound=sounds)
+    sound = None if output.audio is None else Sound.load(output.audio)
     images = render_clip(avatar, clip, path, frames=total, fps=fps, draw=draw, pipelined=pipelined)
     first = next(images)
     avatar.stages.clear()  # the first frame loads what the others find loaded
     start = shown = time.perf_counter()
-    with VideoWriter(output.path, fps=fps) if output.path is not None else _Nowhere() as writer:
+    with VideoWriter(output.path, fps=fps, sound=sound) if output.path is not None else _Nowhere() as writer:
         for done, image in enumerate(_chain(first, images), 1):
             with avatar.stages.time("write"):
                 writer.write(image)
@@ -197,6 +202,7 @@ def render_file(
     stats: Path | None = None,
     deformer: Tier = "auto",
     pipelined: bool = False,
+    audio: Path | None = None,
 ) -> dict[str, Any]:
     """`cap4d render`: see `render_to`; `drive`, `template` and `fps` are `open_source`'s, `size` is `WxH`.
 
@@ -205,7 +211,8 @@ def render_file(
     threads = pipeline_threads() if pipelined else 0
     player = Avatar.load(avatar, deformer=deformer, threads=threads, deformer_budget_ms=math.inf)
     clip = open_source(drive, player.bundle, template=template, fps=fps)
-    wanted = Output(output, frames=frames, size=None if size is None else parse_size(size), stats=stats)
+    pixels = None if size is None else parse_size(size)
+    wanted = Output(output, frames=frames, size=pixels, stats=stats, audio=audio)
     found = render_to(player, clip, camera, wanted, pipelined=pipelined)
     log.info("%s: %d frames, %.1f fps", output, found["frames"], found["fps"])
     return found

@@ -37,11 +37,14 @@ class Surface:
             neutral = neutral + subject.pose_offset
         if subject.pose_basis is not None:
             basis.append(subject.pose_basis)
+        self._pixels = np.ascontiguousarray(
+            grid.pixels[:, 0].astype(np.int32) * grid.size + grid.pixels[:, 1]
+        )
         self._core = _core.GridSurface(
             _floats(neutral),
             _floats(np.concatenate(basis)),
             _floats(subject.skin_weights.T),
-            np.ascontiguousarray(grid.pixels[:, 0].astype(np.int32) * grid.size + grid.pixels[:, 1]),
+            self._pixels,
             grid.size,
             np.ascontiguousarray(grid.deformable),
             _floats(bundle.deform_neutral),
@@ -49,6 +52,9 @@ class Surface:
         self._coefficients, self._late = (np.zeros(sum(map(len, basis)), np.float32) for _ in range(2))
         self._offsets = np.zeros((3, grid.size, grid.size), np.float32)
         self._zero = np.zeros(self._expressions, np.float32)
+        self._neutral_answer, self._deformable = bundle.deform_neutral, bundle.grid.deformable
+        self._linear = None if subject is bundle.subject else bundle.deform_linear  # what the tier folds in
+        self._answer: np.ndarray | None = None  # the network's, of the last frame
         self._rest = self._pose_rig_axes(None)
 
     def pose(
@@ -70,8 +76,19 @@ class Surface:
             turns = self._set(expr, eyes=eye_rot, neck=neck_rot, jaw=jaw_rot)
             self._core.pose(out, offsets, self._coefficients, self._late, turns, rest, self.threads)
         with stages.time("deform"):
-            answer = None if self.deformer is None else self.deformer(offsets)
-            self._core.deform(out, answer, self.threads)
+            self._answer = None if self.deformer is None else self.deformer(offsets)
+            self._core.deform(out, self._answer, self.threads)
+
+    def deformation(self) -> np.ndarray:
+        """float32[G, 3] m, head frame, OpenCV axes: what the network or its stand-in moved last frame."""
+        moved = self._neutral_answer.copy()
+        where = self._deformable
+        if self._answer is not None:
+            moved[where] = self._answer.reshape(3, -1)[:, self._pixels[where]].T
+        elif self._linear is not None:
+            expr = self._coefficients[: self._expressions]
+            moved += np.tensordot(expr, self._linear, 1) * np.float32([1, -1, -1])
+        return moved
 
     def _pose_rig_axes(self, jaw_rot: Rotation) -> np.ndarray:
         """float32[G, 3] m: the face at rest, with a turned jaw."""

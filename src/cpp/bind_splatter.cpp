@@ -30,12 +30,25 @@ class PySplatter {
     return py::make_tuple(image.rgb, image.alpha, image.depth);
   }
 
-  void draw(ByteArray out, DoubleArray viewmat, DoubleArray K, Background background, std::optional<FloatArray> vertices, int threads) {
+  void draw(ByteArray out, DoubleArray viewmat, DoubleArray K, Background background, std::optional<FloatArray> vertices, int threads,
+            bool premultiplied) {
     if (out.ndim() != 3 || out.shape(2) != 4) throw std::invalid_argument("out: expected uint8[H, W, 4]");
     const View view =
         checked_view(viewmat, K, static_cast<int>(std::min<py::ssize_t>(out.shape(1), INT32_MAX)),
                      static_cast<int>(std::min<py::ssize_t>(out.shape(0), INT32_MAX)), background, vertices);
-    draw_alone(view, threads, Image8{out.mutable_data(), !background});
+    if (background && premultiplied) throw std::invalid_argument("premultiplied: expected no background, got one");
+    const Alpha alpha = background ? Alpha::kOpaque : premultiplied ? Alpha::kPremultiplied : Alpha::kStraight;
+    draw_alone(view, threads, Image8{out.mutable_data(), alpha});
+  }
+
+  void count_pixels(py::array_t<std::uint16_t, py::array::c_style> out, int threads) {
+    const Camera& camera = splatter_.last().camera;
+    if (splatter_.last().lists.offsets.get() == nullptr) throw std::invalid_argument("count: expected a picture that was drawn, got none");
+    expect(out, "out", {camera.height, camera.width});
+    std::uint16_t* to = out.mutable_data();
+    py::gil_scoped_release release;
+    std::lock_guard lock(busy_);
+    splatter_.count(threads, to);
   }
 
   py::array_t<std::uint32_t> order(DoubleArray viewmat, std::optional<FloatArray> vertices, int threads) {
@@ -111,7 +124,8 @@ void register_splatter(py::module_& m) {
       .def("render", &PySplatter::render, py::arg("viewmat"), py::arg("K"), py::arg("width"), py::arg("height"), background = py::none(),
            vertices = py::none(), py::arg("threads") = 0)
       .def("draw", &PySplatter::draw, py::arg("out").noconvert(), py::arg("viewmat"), py::arg("K"), background = py::none(), vertices = py::none(),
-           py::arg("threads") = 0)
+           py::arg("threads") = 0, py::arg("premultiplied") = false)
+      .def("count", &PySplatter::count_pixels, py::arg("out").noconvert(), py::arg("threads") = 0)
       .def("order", &PySplatter::order, py::arg("viewmat"), vertices = py::none(), py::arg("threads") = 0)
       .def("__len__", &PySplatter::count)
       .def_property_readonly("drawn", &PySplatter::drawn)

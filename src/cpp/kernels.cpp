@@ -5,7 +5,7 @@
 #include <string>
 #include <string_view>
 
-#include "quantized_layers.h"
+#include "unet_layers.h"
 
 #ifdef CAP4D_HAS_X86_VARIANTS
 #include <cpuid.h>
@@ -15,22 +15,25 @@ namespace cap4d {
 
 namespace base {
 extern const Kernels kKernels;
-extern const UnetKernels kUnetKernels;
+extern const UnetKernels<Int8> kInt8Kernels;
+extern const UnetKernels<Float32> kFloat32Kernels;
 }
 #ifdef CAP4D_HAS_X86_VARIANTS
 namespace v3 {
 extern const Kernels kKernels;
-extern const UnetKernels kUnetKernels;
+extern const UnetKernels<Int8> kInt8Kernels;
+extern const UnetKernels<Float32> kFloat32Kernels;
 }
 namespace v4 {
 extern const Kernels kKernels;
-extern const UnetKernels kUnetKernels;
+extern const UnetKernels<Int8> kInt8Kernels;
+extern const UnetKernels<Float32> kFloat32Kernels;
 }
 namespace avxvnni {
-extern const UnetKernels kUnetKernels;
+extern const UnetKernels<Int8> kInt8Kernels;
 }
 namespace vnni {
-extern const UnetKernels kUnetKernels;
+extern const UnetKernels<Int8> kInt8Kernels;
 }
 #endif
 
@@ -68,14 +71,23 @@ bool has_avxvnni() {
 }
 #endif
 
-const UnetKernels& choose_unet() {
+const UnetKernels<Int8>& choose_int8() {
 #ifdef CAP4D_HAS_X86_VARIANTS
   const std::string_view level = kernels().isa;
   const bool vnni = wanted() == "vnni";
-  if (level == "v4") return vnni && __builtin_cpu_supports("avx512vnni") ? vnni::kUnetKernels : v4::kUnetKernels;
-  if (level == "v3") return vnni && has_avxvnni() ? avxvnni::kUnetKernels : v3::kUnetKernels;
+  if (level == "v4") return vnni && __builtin_cpu_supports("avx512vnni") ? vnni::kInt8Kernels : v4::kInt8Kernels;
+  if (level == "v3") return vnni && has_avxvnni() ? avxvnni::kInt8Kernels : v3::kInt8Kernels;
 #endif
-  return base::kUnetKernels;
+  return base::kInt8Kernels;
+}
+
+const UnetKernels<Float32>& choose_float32() {
+#ifdef CAP4D_HAS_X86_VARIANTS
+  const std::string_view level = kernels().isa;
+  if (level == "v4") return v4::kFloat32Kernels;
+  if (level == "v3") return v3::kFloat32Kernels;
+#endif
+  return base::kFloat32Kernels;
 }
 
 }  // namespace
@@ -85,8 +97,15 @@ const Kernels& kernels() {
   return chosen;
 }
 
-const UnetKernels& unet_kernels() {
-  static const UnetKernels& chosen = choose_unet();
+template <>
+const UnetKernels<Int8>& unet_kernels() {
+  static const UnetKernels<Int8>& chosen = choose_int8();
+  return chosen;
+}
+
+template <>
+const UnetKernels<Float32>& unet_kernels() {
+  static const UnetKernels<Float32>& chosen = choose_float32();
   return chosen;
 }
 

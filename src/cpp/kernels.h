@@ -15,9 +15,11 @@ struct Image {  // caller-owned, row major
   float* depth;  // [H, W] expected depth m: sum of w_i z_i over alpha, 0 where alpha is 0
 };
 
+enum class Alpha { kOpaque, kStraight, kPremultiplied };  // opaque: composited on the background
+
 struct Image8 {  // caller-owned
   std::uint8_t* rgba;  // [H, W, 4] rounded
-  bool straight;       // colour divided by alpha, without a background; else composited on it, alpha 255
+  Alpha alpha;
 };
 
 struct ImageGrad {
@@ -55,6 +57,8 @@ struct Kernels {
                       const GaussianGrads&);
   void (*rasterize_fwd)(const TileJob&, const Image&);
   void (*rasterize_rgba8)(const TileJob&, const Image8&);
+  // How many Gaussians each pixel takes, hidden ones too: counts [H, W].
+  void (*count_gaussians)(const TileJob&, std::uint16_t* counts);
   // Writes grads[slots[i]] for each i of the job.
   void (*rasterize_bwd)(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t* slots, SplatGrad* grads);
 };

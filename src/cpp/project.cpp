@@ -13,6 +13,7 @@ namespace cap4d::CAP4D_ISA {
 extern const Kernels kKernels;
 void rasterize_fwd(const TileJob&, const Image&);
 void rasterize_rgba8(const TileJob&, const Image8&);
+void count_gaussians(const TileJob&, std::uint16_t*);
 void rasterize_bwd(const TileJob&, const Image&, const ImageGrad&, const std::uint32_t*, SplatGrad*);
 
 namespace {
@@ -414,6 +415,6 @@ void project_bwd(const Camera& camera, const GaussiansView& g, std::size_t begin
 
 }  // namespace
 
-const Kernels kKernels = {CAP4D_NAME(CAP4D_ISA), &project_fwd, &project_packed, &triangle_frames, &project_bwd, &rasterize_fwd, &rasterize_rgba8, &rasterize_bwd};
+const Kernels kKernels = {CAP4D_NAME(CAP4D_ISA), &project_fwd, &project_packed, &triangle_frames, &project_bwd, &rasterize_fwd, &rasterize_rgba8, &count_gaussians, &rasterize_bwd};
 
 }  // namespace cap4d::CAP4D_ISA

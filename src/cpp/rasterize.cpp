@@ -270,17 +270,42 @@ void rasterize_rgba8(const TileJob& job, const Image8& image) {
   for (int block = 0; block < kBlocks; ++block) {
     const BlockSums<false>& b = sums[block];
     FloatV color[3] = {b.red, b.green, b.blue}, alpha = splat(1.0f);
-    if (image.straight) {
-      alpha = 1.0f - b.transmittance;
-      for (FloatV& c : color) c = c / max(alpha, splat(1e-6f));
-    } else {
+    if (image.alpha == Alpha::kOpaque) {
       for (int c = 0; c < 3; ++c) color[c] = color[c] + b.transmittance * job.background[c];
+    } else {
+      alpha = 1.0f - b.transmittance;
+      if (image.alpha == Alpha::kStraight)
+        for (FloatV& c : color) c = c / max(alpha, splat(1e-6f));
     }
     const IntV packed = byte_of(color[0]) | byte_of(color[1]) << 8 | byte_of(color[2]) << 16 | byte_of(alpha) << 24;
     std::uint32_t pixels[kLanes];
     std::memcpy(pixels, &packed, sizeof pixels);
     each_pixel(job, block, [&](std::size_t at, int l) { std::memcpy(image.rgba + 4 * at, &pixels[l], 4); });
   }
+}
+
+// Adds a chunk's Gaussians at a block's pixels: those that `draw_block` would take if nothing were hidden.
+CAP4D_INLINE IntV count_block(const TileJob& job, std::size_t begin, const std::uint64_t* words, int block) {
+  const FloatV x = load(kPixel.x) + static_cast<float>(job.x0 + block_x(block)), y = load(kPixel.y) + static_cast<float>(job.y0 + block_y(block));
+  IntV sum = {};
+  for (int w = 0; w < kWords; ++w)
+    for (std::uint64_t word = words[w]; word; word &= word - 1) {
+      Place at;
+      const FloatV exponent = exponent_at(job.splats[job.isects[begin + 64 * w + __builtin_ctzll(word)]], x, y, at);
+      sum += keep_int(less_equal(splat(kLog2AlphaMin), exponent), 1);
+    }
+  return sum;
+}
+
+void count_gaussians(const TileJob& job, std::uint16_t* counts) {
+  IntV sums[kBlocks] = {};
+  Meetings meetings;
+  for (std::size_t begin = 0; begin < job.count; begin += kChunk) {
+    meet_by_block(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), meetings);
+    for (int block = 0; block < kBlocks; ++block) sums[block] += count_block(job, begin, meetings.blocks[block], block);
+  }
+  for (int block = 0; block < kBlocks; ++block)
+    each_pixel(job, block, [&](std::size_t at, int l) { counts[at] = static_cast<std::uint16_t>(std::min<std::int32_t>(sums[block][l], UINT16_MAX)); });
 }
 
 // backward ----------------------------------------------------------------------------------------------------------------------

@@ -179,6 +179,10 @@ void Splatter::draw(const View& view, int threads, const Image8& image) {
   each_tile(rendered_, threads, [&](const TileJob& job) { kernels().rasterize_rgba8(job, image); });
 }
 
+void Splatter::count(int threads, std::uint16_t* counts) {
+  each_tile(rendered_, threads, [&](const TileJob& job) { kernels().count_gaussians(job, counts); });
+}
+
 void render_bwd(const Rendered& r, const GaussiansView& gaussians, const Image& image, const ImageGrad& v_image, int threads,
                 const GaussianGrads& grads) {
   auto pair_grads = make_buffer<SplatGrad>(r.pairs);

@@ -62,6 +62,9 @@ class Splatter {
   void draw(const View& view, int threads, const Image& image);
   void draw(const View& view, int threads, const Image8& image);
 
+  // counts [H, W] of the last picture drawn: how many Gaussians each pixel takes, hidden ones too.
+  void count(int threads, std::uint16_t* counts);
+
   // order [N]: near to far along the third row of `viewmat` [4, 4]; equal depths keep their order, non-finite ones come last.
   void order(const double* viewmat, const float* vertices, int threads, std::uint32_t* order);
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from gl_drivers import NO_DRIVER
 from tiny_bundle import tiny_bundle
 
 from cap4d import _core
@@ -21,8 +22,6 @@ from cap4d.player.avatar import Avatar
 from cap4d.render import render
 from cap4d.rig.builtin import build_head
 from cap4d.rig.grid import build_grid, remesh
-
-NO_DRIVER = 77  # exit code
 
 
 @dataclass(frozen=True, eq=False)

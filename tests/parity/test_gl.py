@@ -1,23 +1,16 @@
 """OpenGL draws what the CPU renderer draws, on every software driver of Mesa."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cap4d.app.splat_pass import render_constants
-from gl_scenes import NO_DRIVER, SCENES, avatar_views, scene
+from gl_drivers import DRIVERS, drawn_with
+from gl_scenes import SCENES, avatar_views, scene
 from tiny_bundle import tiny_bundle
 
 from cap4d.player.avatar import Avatar
-
-DRIVERS = {
-    "llvmpipe": {"LIBGL_ALWAYS_SOFTWARE": "1", "GALLIUM_DRIVER": "llvmpipe"},
-    "zink": {"LIBGL_ALWAYS_SOFTWARE": "1", "MESA_LOADER_DRIVER_OVERRIDE": "zink"},
-}
 
 # Least PSNR on white, dB, and largest difference of a channel. Float blending and the tiles' arithmetic agree
 # to rounding, except that one alone may skip a contribution near 1/255, and that blending cannot stop.
@@ -34,18 +27,7 @@ def pictures(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, np.ndarray]:
     """What gl_scenes.py draws with one driver, in a process of its own."""
-    output = tmp_path_factory.mktemp("gl") / "pictures.npz"
-    here = Path(__file__).resolve().parent
-    environment = os.environ | DRIVERS[request.param] | {"PYTHONPATH": str(here.parent)}
-    program = [sys.executable, here / "gl_scenes.py", output]
-    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=300)
-    if done.returncode == NO_DRIVER:
-        pytest.skip(f"{request.param}: {done.stderr.strip().splitlines()[-1]}")
-    assert done.returncode == 0, done.stderr
-    found = dict(np.load(output))
-    if request.param not in str(found["driver"]):
-        pytest.skip(f"{request.param} is not installed: got {found['driver']}")
-    return found
+    return drawn_with(request.param, "gl_scenes.py", tmp_path_factory.mktemp("gl") / "pictures.npz")
 
 
 def test_the_shaders_constants_are_those_of_the_cpu_renderer():

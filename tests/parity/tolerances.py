@@ -74,3 +74,6 @@ ROTATION = 25
 # axis; trained ones come several times nearer (bench_deformer).
 INT8_RMS_MM = 0.08
 INT8_MOST_MM = 0.4
+
+# The same in float32, on each instruction set, against torch in float64: of the answers' range.
+FLOAT_UNET = 2e-6

@@ -9,7 +9,7 @@ from cap4d.app.options import parse_options
 def test_nothing_asked_for_is_a_window_on_the_demo():
     options = parse_options([])
     assert options.avatar is None
-    assert options.size == (512, 512)
+    assert options.size is None
     assert (options.backend, options.deformer, options.camera) == ("auto", "auto", "static")
     assert not options.headless
 

@@ -44,3 +44,27 @@ def test_rewinding_starts_over():
     clock.index(1.0)
     clock.rewind(1.0)
     assert [clock.index(t) for t in (1.0, 1.1)] == [0, 1]
+
+
+def test_speed_changes_how_fast_frames_come_and_not_which_is_shown():
+    clock = PlayClock(10, 0.0)
+    clock.index(1.0)
+    clock.change_speed(0.5, 1.0)
+    assert [clock.index(t) for t in (1.0, 1.1, 1.2, 1.4)] == [10, 10, 11, 12]
+    assert clock.due() == pytest.approx(1.6)
+
+
+def test_seeking_plays_on_from_there():
+    clock = PlayClock(10, 0.0)
+    clock.index(2.0)
+    clock.seek(3, 2.0)
+    assert [clock.index(t) for t in (2.0, 2.1)] == [3, 4]
+    clock.seek(-5, 3.0)
+    assert clock.index(3.0) == 0
+
+
+def test_it_follows_another_clock():
+    clock = PlayClock(10, 0.0, speed=2.0)
+    clock.index(0.0)
+    clock.follow(1.0, 5.0)
+    assert clock.index(5.0) == 10

@@ -88,7 +88,7 @@ def test_an_error_in_the_fragment_stage_names_its_file(ctx):
         build_program(ctx, "a", {"ONE": 1.0}, read=read)
 
 
-@pytest.mark.parametrize("name", ["project.vert", "splat.vert", "splat.frag", "present.frag", "hud.frag"])
+@pytest.mark.parametrize("name", ["project.vert", "splat.vert", "splat.frag", "present.frag", "panel.frag"])
 def test_the_installed_shaders_are_found(name):
     assert "void main()" in read_package_shader(name)
 

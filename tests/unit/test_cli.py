@@ -25,6 +25,7 @@ COMMANDS = (
     ["fit"],
     ["optimize"],
     ["render"],
+    ["drive"],
     ["inspect"],
     ["bench"],
 )

@@ -42,6 +42,46 @@ def video(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.fixture
+def built(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
+    """The demo avatars that were built, into a cache of the test's own."""
+    done: list[Path] = []
+
+    def build(rig: object, path: Path) -> None:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("an avatar")
+        done.append(path)
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(demo, "build_demo_avatar", build)
+    return done
+
+
+def test_the_demo_is_built_once_and_then_found_without_its_head(built, monkeypatch) -> None:
+    path = demo.demo_avatar_path()
+    assert built == [path]
+    monkeypatch.setattr("cap4d.rig.builtin.build_head", lambda: pytest.fail("the head was built"))
+    assert demo.demo_avatar_path() == path
+
+
+def test_other_code_or_a_lost_avatar_is_looked_for_anew(built, monkeypatch) -> None:
+    path = demo.demo_avatar_path()
+    path.unlink()
+    assert demo.remembered_demo() is None
+    assert demo.demo_avatar_path() == path
+    assert built == [path, path]
+    monkeypatch.setattr(demo, "code_fingerprint", lambda: "other")
+    assert demo.remembered_demo() is None
+
+
+@pytest.mark.parametrize("content", ["", "[", "{}", "[1]", '["CODE", "../../etc/passwd"]', '["CODE", 3]'])
+def test_a_broken_record_is_none(built, content) -> None:
+    demo.demo_avatar_path()
+    content = content.replace("CODE", demo.code_fingerprint())
+    (demo.cache_folder() / demo.DEMO_RECORD).write_text(content)
+    assert demo.remembered_demo() is None
+
+
 def test_the_road_is_walked_once(work, video, tmp_path, builtin_rig) -> None:
     first = demo.avatar_from_video(video, builtin_rig, tmp_path / "a" / "out", preset="low")
     again = demo.avatar_from_video(video, builtin_rig, tmp_path / "a" / "out", preset="low")

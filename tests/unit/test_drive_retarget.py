@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,27 +9,16 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from drive_bundle import on_rig
 from tiny_bundle import tiny_bundle, tiny_clip
 
 from cap4d.bundle import Bundle
-from cap4d.drive.clip import Clip
 from cap4d.drive.retarget import Retargeter
 from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
 from cap4d.rig.head import HeadRig
 
 RNG = np.random.default_rng(3)
-
-
-def on_rig(rig: HeadRig, *, size: int = 128) -> Bundle:
-    """A bundle that stands on a real rig; its Gaussians are the tiny one's and do not matter here."""
-    from cap4d.rig.grid import build_grid, remesh
-
-    grid, mesh = build_grid(rig, size), rig.subject()
-    zeros = np.zeros((2, 3), np.float32)
-    idle = Clip(rig.name, 24.0, np.zeros((2, rig.n_expressions), np.float32), zeros, zeros, zeros)
-    parts = dict(grid=grid, subject=remesh(mesh, grid), mesh_subject=mesh, idle=idle, rig_vertices=0)
-    return replace(tiny_bundle(8, network=False), expression_range=rig.expression_range, **parts)
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:

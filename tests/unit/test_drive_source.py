@@ -70,7 +70,7 @@ def test_a_template_goes_with_vertices_only(bundle: Bundle, tmp_path: Path) -> N
             open_source(spec, bundle, template=tmp_path / "neutral.npy")
 
 
-@pytest.mark.parametrize("spec", ["a.csv", "webcam://0", "-", "clip"])
+@pytest.mark.parametrize("spec", ["a.txt", "webcam://0", "-", "clip"])
 def test_other_sources_are_argument_errors(spec: str, bundle: Bundle) -> None:
     with pytest.raises(ArgumentError, match="drive: expected"):
         open_source(spec, bundle)

@@ -139,6 +139,15 @@ def test_a_name_may_hold_a_percent_sign(name: str, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == [name.replace("%3d", "  0")]
 
 
+def test_alpha_does_not_show_in_a_video(tmp_path: Path) -> None:
+    image, videos = picture(20, 30, 4), []
+    for name, frame in (("a.mp4", image), ("b.mp4", image[..., :3])):
+        with VideoWriter(tmp_path / name, fps=24) as video:
+            video.write(frame)
+        videos.append(decoded(tmp_path / name)[0])
+    assert np.array_equal(*videos)
+
+
 def test_a_video_refuses_what_its_codec_would(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "a.mp4", fps=24) as video, pytest.raises(ArgumentError, match="8192 px"):
         video.write(np.zeros((1, 8193, 3), np.uint8))

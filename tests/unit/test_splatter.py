@@ -69,6 +69,43 @@ def test_bytes_are_the_rounded_picture(background: tuple[float, ...] | None) -> 
     assert np.abs(out[seen] - expected[seen]).max() <= 0.52
 
 
+def test_premultiplied_bytes_are_the_rounded_picture() -> None:
+    gaussians, camera = cloud(), view(61, 45)
+    splatter, out = _core.Splatter(*arrays(gaussians)), np.full((45, 61, 4), 7, np.uint8)
+    splatter.draw(out, camera.viewmat, camera.K, premultiplied=True)
+    rgb, alpha, _ = splatter.render(camera.viewmat, camera.K, 61, 45)
+    expected = np.concatenate([rgb, alpha[..., None]], -1).clip(0, 1) * 255
+    assert np.abs(out - expected).max() <= 0.52
+    with pytest.raises(ValueError, match="premultiplied: expected no background"):
+        splatter.draw(out, camera.viewmat, camera.K, (1.0, 1.0, 1.0), premultiplied=True)
+
+
+def test_counts_every_gaussian_at_every_pixel() -> None:
+    """Against pictures of one Gaussian each: it is where its alpha is not zero, seen or hidden."""
+    gaussians, camera = cloud(150, seed=3), view(61, 45)
+    fields, where = arrays(gaussians), (camera.viewmat, camera.K, 61, 45)
+    expected = np.zeros((45, 61), int)
+    for i in range(len(fields[0])):
+        expected += _core.render(*(np.ascontiguousarray(x[i : i + 1]) for x in fields), *where)[1] > 0
+    splatter, picture = _core.Splatter(*fields), np.empty((45, 61, 4), np.uint8)
+    splatter.draw(picture, *where[:2])
+    found = np.full((45, 61), 999, np.uint16)
+    splatter.count(found, threads=1)
+    assert expected.max() > 20 and (found != expected).mean() < 2e-3
+    again = np.empty_like(found)
+    splatter.count(again)
+    assert np.array_equal(found, again)
+
+
+def test_counting_needs_a_picture_and_its_size() -> None:
+    splatter, camera = _core.Splatter(*arrays(cloud())), view(61, 45)
+    with pytest.raises(ValueError, match="count: expected a picture"):
+        splatter.count(np.empty((45, 61), np.uint16))
+    splatter.draw(np.empty((45, 61, 4), np.uint8), camera.viewmat, camera.K)
+    with pytest.raises(ValueError, match="out"):
+        splatter.count(np.empty((61, 45), np.uint16))
+
+
 def test_rides_on_triangles_as_bind_does() -> None:
     vertices, faces = mesh(40)
     rng = np.random.default_rng(1)

@@ -2,13 +2,14 @@
 #include <pybind11/stl.h>
 
 #include <algorithm>
-#include <cmath>
+#include <bit>
+#include <optional>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
 
 #include "bindings.h"
-#include "quantized_layers.h"
-#include "quantized_unet.h"
+#include "unet.h"
 
 namespace py = pybind11;
 
@@ -58,64 +59,86 @@ ActivationTensors take_activation(const Tensors& tensors, const std::string& nam
   return out;
 }
 
-UnetTensors take_all(const Tensors& tensors, int size) {
+template <class N>
+UnetTensors<N> take_all(const Tensors& tensors, int size) {
+  constexpr bool kScaled = std::is_same_v<N, Int8>;
   check_unet_size(size);
   const int depth = unet_depth(size), half = size / 2, width = tensors.width();
-  UnetTensors t{};
+  UnetTensors<N> t{};
   t.size = size, t.width = width;
   t.mask = tensors.take<std::uint8_t>("mask", {size, size});
   t.weight = tensors.take<float>("down0.weight", {width, 3, 4, 4});
   t.rows = tensors.take<float>("down0.rows", {3, half, width});
   t.columns = tensors.take<float>("down0.columns", {3, half, width});
-  t.out = take_activation(tensors, "down0", width, false);
+  if (kScaled) t.out = take_activation(tensors, "down0", width, false);
   for (int i = 1; i < depth; ++i) {
     const std::string name = "down" + std::to_string(i);
     const int outputs = unet_channels(width, i);
-    DownTensors& down = t.down.emplace_back();
-    down.weight = tensors.take<std::int8_t>(name + ".weight", {outputs, unet_channels(width, i - 1), 4, 4});
-    down.scale = tensors.take<float>(name + ".scale", {outputs});
+    DownTensors<N>& down = t.down.emplace_back();
+    down.weight = tensors.take<typename N::Weight>(name + ".weight", {outputs, unet_channels(width, i - 1), 4, 4});
+    if (kScaled) down.scale = tensors.take<float>(name + ".scale", {outputs});
     if (i == depth - 1) down.bias = tensors.take<float>(name + ".bias", {outputs});
-    down.out = take_activation(tensors, name, outputs, i == depth - 1);
+    if (kScaled) down.out = take_activation(tensors, name, outputs, i == depth - 1);
   }
   for (int i = 0; i < depth; ++i) {
     const std::string name = "up" + std::to_string(i);
     const int inputs = unet_channels(width, i) * (i == depth - 1 ? 1 : 2), outputs = i ? unet_channels(width, i - 1) : 3;
-    UpTensors& up = t.up.emplace_back();
-    up.weight = tensors.take<std::int8_t>(name + ".weight", {inputs, outputs, 4, 4});
-    up.scale = tensors.take<float>(name + ".scale", {outputs});
-    if (i)
-      up.relu_scale = tensors.take<float>(name + ".relu_scale", {outputs});
-    else
-      up.bias = tensors.take<float>(name + ".bias", {outputs});
+    UpTensors<N>& up = t.up.emplace_back();
+    up.weight = tensors.take<typename N::Weight>(name + ".weight", {inputs, outputs, 4, 4});
+    if (kScaled || i == 0) up.scale = tensors.take<float>(name + ".scale", {outputs});
+    if (kScaled && i) up.relu_scale = tensors.take<float>(name + ".relu_scale", {outputs});
+    if (i == 0) up.bias = tensors.take<float>(name + ".bias", {outputs});
   }
   return t;
 }
 
-std::unique_ptr<QuantizedUnet> make(const py::dict& dict, int size) { return std::make_unique<QuantizedUnet>(take_all(Tensors(dict), size)); }
+template <class N>
+std::unique_ptr<Unet<N>> make(const py::dict& dict, int size) {
+  return std::make_unique<Unet<N>>(take_all<N>(Tensors(dict), size));
+}
 
-FloatArray run(QuantizedUnet& net, FloatArray offsets, int threads) {
+// Looks at every exponent and never stops early: this way it is vectorised.
+bool all_finite(const float* values, std::size_t count) {
+  constexpr std::uint32_t kExponent = 0x7f800000;
+  std::uint32_t found = 0;
+  for (std::size_t i = 0; i < count; ++i) found |= (std::bit_cast<std::uint32_t>(values[i]) & kExponent) == kExponent;
+  return found == 0;
+}
+
+void expect_map(const FloatArray& map, const char* name, py::ssize_t size) {
+  if (map.ndim() != 3 || map.shape(0) != 3 || map.shape(1) != size || map.shape(2) != size)
+    throw std::invalid_argument(std::string(name) + ": expected float32[3, " + std::to_string(size) + ", " + std::to_string(size) + "]");
+}
+
+template <class N>
+FloatArray run(Unet<N>& net, FloatArray offsets, int threads, std::optional<FloatArray> out) {
   const py::ssize_t size = net.size();
-  if (offsets.ndim() != 3 || offsets.shape(0) != 3 || offsets.shape(1) != size || offsets.shape(2) != size)
-    throw std::invalid_argument("offsets: expected float32[3, " + std::to_string(size) + ", " + std::to_string(size) + "]");
-  if (!std::all_of(offsets.data(), offsets.data() + offsets.size(), [](float x) { return std::isfinite(x); }))
-    throw std::invalid_argument("offsets: expected finite numbers, got one that is not");
-  FloatArray out({py::ssize_t{3}, size, size});
-  float* to = out.mutable_data();
+  expect_map(offsets, "offsets", size);
+  if (out) expect_map(*out, "out", size);
+  if (!all_finite(offsets.data(), offsets.size())) throw std::invalid_argument("offsets: expected finite numbers, got one that is not");
+  FloatArray answer = out ? *out : FloatArray({py::ssize_t{3}, size, size});
+  float* to = answer.mutable_data();
   {
     py::gil_scoped_release release;
     net.run(offsets.data(), threads, to);
   }
-  return out;
+  return answer;
+}
+
+template <class N>
+void register_unet_of(py::module_& m, const char* name, const char* doc) {
+  py::class_<Unet<N>>(m, name, doc)
+      .def(py::init(&make<N>), py::arg("tensors"), py::arg("size"))
+      .def_property_readonly("size", &Unet<N>::size)
+      .def_property_readonly_static("isa", [](const py::object&) { return unet_kernels<N>().isa; })
+      .def("run", &run<N>, py::arg("offsets").noconvert(), py::arg("threads") = 0, py::arg("out").noconvert() = py::none());
 }
 
 }  // namespace
 
-void register_quantized_unet(py::module_& m) {
-  py::class_<QuantizedUnet>(m, "QuantizedUnet", "The deformation U-Net in 8-bit integers.")
-      .def(py::init(&make), py::arg("tensors"), py::arg("size"))
-      .def_property_readonly("size", &QuantizedUnet::size)
-      .def_property_readonly_static("isa", [](const py::object&) { return unet_kernels().isa; })
-      .def("run", &run, py::arg("offsets").noconvert(), py::arg("threads") = 0);
+void register_unet(py::module_& m) {
+  register_unet_of<Int8>(m, "QuantizedUnet", "The deformation U-Net in 8-bit integers.");
+  register_unet_of<Float32>(m, "FloatUnet", "The deformation U-Net in float32.");
 }
 
 }  // namespace cap4d

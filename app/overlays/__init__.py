@@ -1,0 +1,1 @@
+"""Overlays: what the picture is made of, drawn over it."""

@@ -1,0 +1,83 @@
+"""Frames over UDP: a line of JSON a datagram, or several (`wire`); 5,023 vertices are too many for one."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+from cap4d.drive.gate import Gate
+from cap4d.drive.packet import Cause, Sink
+from cap4d.drive.tcp import authority, listen
+
+MAX_DATAGRAM = 1 << 16
+RECEIVE_BUFFER = 1 << 20  # bytes the system keeps for us
+POLL = 0.1  # s
+MAX_REFUSED, BREATH = 64, 10e-3  # datagrams refused in a row, after which to let the system drop some; s
+SO_RXQ_OVFL = 40 if sys.platform == "linux" else None  # the system tells how many it dropped
+
+
+class UdpReceiver:
+    """A bound socket; see `packet.Receiver`.
+
+    Args:
+        host: To listen on.
+        port: 0 for any that is free; `address` names it.
+        token: What the key `token` of every line has to say; None for no such key.
+    Raises:
+        ArgumentError: There is no listening there.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        token: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.token, self._clock = token, clock
+        self._socket = listen(host, port, socket.SOCK_DGRAM, "udp")
+        self._socket.settimeout(POLL)
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+            if SO_RXQ_OVFL is not None:
+                self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        self.address = f"udp://{authority(self._socket)}"
+        self._overflowed = 0
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """See `packet.Receiver`."""
+        gate, refused = Gate(sink, token=self.token), 0
+        with self._socket:
+            while not stop.is_set():
+                data, sender = self._receive(sink)
+                for line in data.split(b"\n"):
+                    if line.strip():
+                        refused = refused + 1 if gate.line(sender, line, self._clock()) is None else 0
+                if refused > MAX_REFUSED:
+                    refused = 0
+                    stop.wait(BREATH)
+
+    def _receive(self, sink: Sink) -> tuple[bytes, object]:
+        """A datagram and who sent it; an empty one where none came."""
+        try:
+            if SO_RXQ_OVFL is None:
+                return self._socket.recvfrom(MAX_DATAGRAM)
+            data, extra, _, sender = self._socket.recvmsg(MAX_DATAGRAM, socket.CMSG_SPACE(4))
+        except OSError:  # time is up; or what we never sent could not be delivered, as Windows says
+            return b"", None
+        for level, kind, value in extra:
+            if (level, kind, len(value)) == (socket.SOL_SOCKET, SO_RXQ_OVFL, 4):
+                self._count_overflow(sink, struct.unpack("@I", value)[0])
+        return data, sender
+
+    def _count_overflow(self, sink: Sink, total: int) -> None:
+        """Datagrams that the system dropped, since the socket was made, modulo 2^32."""
+        if lost := (total - self._overflowed) % (1 << 32):
+            self._overflowed = total
+            sink.rejected(Cause.FLOOD, "more datagrams than the system keeps", times=lost)

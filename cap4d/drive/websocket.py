@@ -1,0 +1,161 @@
+"""Frames over WebSocket: the player is the server, a sender's message is a line of JSON (`wire`), or several.
+
+A web page may drive the player of the computer it is looked at on only with the token, or when it comes
+from that computer itself: browsers name the page in `Origin`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, urlsplit
+
+from cap4d.drive.gate import Gate
+from cap4d.drive.pace import Pace
+from cap4d.drive.packet import Cause, Sink
+from cap4d.drive.tcp import FLOODED, GREETING, IDLE, MAX_CONNECTIONS, authority, listen
+from cap4d.drive.wire import MAX_LINE, same_token
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+POLL = 0.1  # s
+AHEAD = 0.25  # s; whether more waits to be read is not known here, so what is less may be jitter
+LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
+TRY_AGAIN_LATER, POLICY = 1013, 1008  # close codes, RFC 6455 7.4.1 and IANA's registry
+
+
+class WebSocketReceiver:
+    """A WebSocket server; see `packet.Receiver`.
+
+    Args:
+        host: To listen on.
+        port: 0 for any that is free; `address` names it.
+        token: Asked for in the URL, `?token=...`, or as `Authorization: Bearer ...`; None for none.
+    Raises:
+        ArgumentError: There is no listening there.
+        ModuleNotFoundError: The package websockets is not installed.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        token: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        import websockets  # noqa: F401  its absence is told before anything starts
+
+        self.token, self._clock = token, clock
+        self._listener = listen(host, port, socket.SOCK_STREAM, "ws")
+        self._listener.listen(MAX_CONNECTIONS)
+        self.address = f"ws://{authority(self._listener)}"
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """See `packet.Receiver`."""
+        with self._listener:
+            asyncio.run(self._serve(sink, stop))
+
+    async def _serve(self, sink: Sink, stop: threading.Event) -> None:
+        from websockets.asyncio.server import serve
+
+        visitors = _Visitors(sink, self.token, self._clock)
+        async with serve(
+            visitors.drive,
+            sock=self._listener,
+            process_request=visitors.admit,
+            compression=None,
+            max_size=MAX_LINE,
+            max_queue=16,
+            open_timeout=GREETING,
+            ping_interval=IDLE / 4,
+            ping_timeout=IDLE / 4,
+            close_timeout=POLL,
+            server_header=None,
+            logger=_quiet(),
+        ):
+            while not stop.is_set():
+                await asyncio.sleep(POLL)
+
+
+class _Visitors:
+    """The connections of one server, in its event loop."""
+
+    def __init__(self, sink: Sink, token: str | None, clock: Callable[[], float]) -> None:
+        self.sink, self.token, self.clock = sink, token, clock
+        self.gate, self.count = Gate(sink), 0
+
+    def admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuses who lacks the token, comes from a foreign page, or is one too many."""
+        if not same_token(_token(request), self.token):
+            self.sink.rejected(Cause.TOKEN, "a connection without the token")
+            return connection.respond(HTTPStatus.UNAUTHORIZED, "expected ?token=...\n")
+        origin = request.headers.get("Origin")
+        if self.token is None and origin is not None and urlsplit(origin).hostname not in LOCAL:
+            self.sink.rejected(Cause.TOKEN, f"a web page of {origin[:100]} without a token")
+            return connection.respond(HTTPStatus.FORBIDDEN, "a page of another host needs ?token=...\n")
+        if self.count >= MAX_CONNECTIONS:
+            self.sink.rejected(Cause.SENDER, f"{MAX_CONNECTIONS} are connected already")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many connections\n")
+        return None
+
+    async def drive(self, connection: ServerConnection) -> None:
+        """One connection, until it ends."""
+        from websockets.exceptions import ConnectionClosed, PayloadTooBig
+
+        self.count += 1
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                await self._listen_to(connection)
+            if isinstance(connection.protocol.parser_exc, PayloadTooBig):
+                self.sink.rejected(Cause.SIZE, "a message is longer than any frame")
+        finally:
+            self.count -= 1
+            self.gate.leave(connection)
+
+    async def _listen_to(self, connection: ServerConnection) -> None:
+        pace, patience = Pace(), GREETING
+        while True:
+            try:
+                message = await asyncio.wait_for(connection.recv(decode=False), patience)
+            except TimeoutError:
+                self.sink.rejected(Cause.SENDER, "a connection is silent")
+                return await connection.close(POLICY, "silent")
+            patience = IDLE
+            if not self.gate.rules(connection, self.clock()):
+                await asyncio.sleep(POLL)  # for one who rules to have hung up just now
+            lines = deque(line for line in message.split(b"\n") if line.strip())
+            while lines:
+                now = self.clock()
+                t = self.gate.line(connection, lines.popleft(), now)
+                if not self.gate.rules(connection, now):
+                    return await connection.close(TRY_AGAIN_LATER, "another one sends already")
+                if self.gate.flooded:
+                    self.sink.rejected(Cause.FLOOD, times=len(lines))
+                    lines.clear()
+                    await asyncio.sleep(FLOODED)
+                elif t is not None and (lead := pace.lead(t, now) - AHEAD) > 0:
+                    await asyncio.sleep(lead)
+
+
+def _token(request: Request) -> str | None:
+    given = parse_qs(urlsplit(request.path).query).get("token")
+    kind, _, value = request.headers.get("Authorization", "").partition(" ")
+    return given[0] if given else value if kind.lower() == "bearer" else None
+
+
+def _quiet() -> logging.Logger:
+    """Strangers who break the protocol are counted, not told of."""
+    logger = logging.getLogger(__name__ + ".connections")
+    logger.setLevel(logging.CRITICAL)
+    return logger
