@@ -36,20 +36,23 @@ class Detector:
 
     Args:
         video: Images follow each other: the face is searched near where it was.
+        copies: Of each image whose landmarks are averaged, 1 to 4; the first is the image as it is.
     """
 
-    def __init__(self, *, video: bool) -> None:
-        solutions = _import_mediapipe().solutions
+    def __init__(self, *, video: bool, copies: int = len(WOBBLES)) -> None:
+        self._solutions = _import_mediapipe().solutions
         settings = dict(static_image_mode=not video, refine_landmarks=True, max_num_faces=1)
-        self._meshes = [solutions.face_mesh.FaceMesh(**settings) for _ in WOBBLES]
-        self._segmentation = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
+        self._meshes = [self._solutions.face_mesh.FaceMesh(**settings) for _ in WOBBLES[:copies]]
+        self._segmenter = None
 
     def __enter__(self) -> Detector:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for graph in (*self._meshes, self._segmentation):
+        for graph in self._meshes:
             graph.close()
+        if self._segmenter is not None:
+            self._segmenter.close()
 
     def landmarks(self, image: np.ndarray) -> np.ndarray | None:
         """The face in uint8[H, W, 3]: float64[478, 2] px (pixel centres at .5), or None where there is none.
@@ -57,7 +60,7 @@ class Detector:
         The mean over wobbled copies of the image in which the face was found.
         """
         found = []
-        for mesh, wobble in zip(self._meshes, WOBBLES, strict=True):
+        for mesh, wobble in zip(self._meshes, WOBBLES, strict=False):
             affine, size = _canvas(image.shape[:2], wobble)
             points = _face(mesh, _warped(image, affine, size), size)
             if points is not None:
@@ -68,12 +71,17 @@ class Detector:
         """Coarse coverage of the person, float32[H, W] in [0, 1]: the mean over image and mirror image."""
         affine, size = _canvas(image.shape[:2], WOBBLES[0])
         square = _warped(image, affine, size)
-        straight = self._segmentation.process(square).segmentation_mask
-        mirrored = self._segmentation.process(np.ascontiguousarray(square[:, ::-1])).segmentation_mask
+        straight = self._segmentation(square)
+        mirrored = self._segmentation(np.ascontiguousarray(square[:, ::-1]))
         mean = (straight + mirrored[:, ::-1]) / 2
         height, width = image.shape[:2]
         inverse = cv2.invertAffineTransform(_corner_based(affine))
         return np.clip(cv2.warpAffine(mean, inverse, (width, height), borderMode=cv2.BORDER_REPLICATE), 0, 1)
+
+    def _segmentation(self, square: np.ndarray) -> np.ndarray:
+        if self._segmenter is None:  # who only asks for landmarks does not wait for it
+            self._segmenter = self._solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
+        return self._segmenter.process(square).segmentation_mask
 
 
 @contextmanager
