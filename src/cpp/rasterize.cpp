@@ -296,10 +296,10 @@ CAP4D_INLINE IntV count_block(const TileJob& job, std::size_t begin, const std::
 
 void count_gaussians(const TileJob& job, std::uint16_t* counts) {
   IntV sums[kBlocks] = {};
-  Meetings meetings;
+  GaussianSet gaussians[kBlocks];
   for (std::size_t begin = 0; begin < job.count; begin += kChunk) {
-    meet_by_block(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), meetings);
-    for (int block = 0; block < kBlocks; ++block) sums[block] += count_block(job, begin, meetings.blocks[block], block);
+    meet<false>(job, begin, static_cast<int>(std::min<std::size_t>(kChunk, job.count - begin)), gaussians, nullptr);
+    for (int block = 0; block < kBlocks; ++block) sums[block] += count_block(job, begin, gaussians[block], block);
   }
   for (int block = 0; block < kBlocks; ++block)
     each_pixel(job, block, [&](std::size_t at, int l) { counts[at] = static_cast<std::uint16_t>(std::min<std::int32_t>(sums[block][l], UINT16_MAX)); });

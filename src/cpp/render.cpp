@@ -182,7 +182,7 @@ void Splatter::draw(const View& view, int threads, const Image8& image) {
 }
 
 void Splatter::count(int threads, std::uint16_t* counts) {
-  each_tile(rendered_, threads, [&](const TileJob& job) { kernels().count_gaussians(job, counts); });
+  each_tile(rendered_, threads, [&](const TileJob& job, std::uint32_t) { kernels().count_gaussians(job, counts); });
 }
 
 void render_bwd(const Rendered& r, const GaussiansView& gaussians, const Image& image, const ImageGrad& v_image, int threads,
