@@ -50,8 +50,9 @@ def _play_live_source(path: Path, avatar: Avatar, options: Options) -> None:
     if options.pipeline:
         raise ArgumentError(f"pipeline: expected a file to play, got {options.drive}, which comes live")
     backend, draw = choose_backend(options.backend, avatar)
-    out, fillers = options.out or f"{path.stem}.mp4", Fillers(avatar.bundle)
-    with open_live(options.drive, avatar.bundle, template=options.template, fillers=fillers) as stream:
+    out, fillers = options.out or f"{path.stem}.mp4", Fillers(avatar.bundle, **options.fill)
+    settings = dict(template=options.template, sender=options.sender, fillers=fillers)
+    with open_live(options.drive, avatar.bundle, **settings) as stream:
         stats = record_live(avatar, stream, options, out, draw=draw, backend=backend)
     drive = stats["drive"]
     log.info(

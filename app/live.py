@@ -60,11 +60,12 @@ def open_viewer(path: Path, options: Options) -> Viewer:
         ArgumentError, DataError: See `play_live`.
     """
     loaded = load_avatar(path, options.deformer)
-    playback = open_playback(options.drive, loaded.bundle, template=options.template, fps=options.fps)
+    playback = open_playback(options.drive, loaded.bundle, **options.driving)
     loaded.avatar.check_rig(playback.rig_name)
     viewer = Viewer(
         loaded,
         playback,
+        fill=options.fill,
         camera=options.camera,
         deformer=options.deformer,
         recent=RecentFiles(config_folder() / "recent.json"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,8 @@ from cap4d.player.offline import head_centre
 
 QUICK_TIERS = ("linear", "off")
 """Deformers that are there at once; the first that an avatar has shows its first picture."""
+ALL: Mapping[str, bool] = {}
+"""Every filler."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +77,25 @@ def with_deformer(loaded: Loaded, deformer: str) -> Loaded:
 
 
 def open_playback(
-    spec: str | None, bundle: Bundle, *, template: Path | None = None, fps: float | None = None
+    spec: str | None,
+    bundle: Bundle,
+    *,
+    template: Path | None = None,
+    fps: float | None = None,
+    sender: Path | None = None,
+    fill: Mapping[str, bool] = ALL,
 ) -> Playback:
     """What drives an avatar, from `--drive`'s words; it starts now. What a live source lacks is filled in.
 
+    Args:
+        spec, bundle, template, fps, sender: See `open_source` and `open_live`.
+        fill: Which fillers there are to be; see `Fillers`.
     Raises:
         ArgumentError, DataError: See `open_source` and `open_live`.
     """
     if is_live(spec):
-        stream = open_live(spec, bundle, template=template, fps=fps, fillers=Fillers(bundle))
+        settings = dict(template=template, fps=fps, sender=sender, fillers=Fillers(bundle, **fill))
+        stream = open_live(spec, bundle, **settings)
         return StreamPlayback(stream, rig_name=bundle.rig_name)
     clip = open_source(spec, bundle, template=template, fps=fps)
     name = "idle clip" if spec is None else Path(spec).name

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from cap4d.errors import ArgumentError
 
@@ -54,10 +55,24 @@ class Options:
     frames: int | None
     out: str | None
     camera: str
+    blink: bool
+    gaze: bool
+    neck: bool
+    sender: Path | None
     audio: Path | None
     stats: Path | None
     serve: str | None
     token: str | None
+
+    @property
+    def fill(self) -> dict[str, bool]:
+        """Which fillers of a live source there are to be; see `Fillers`."""
+        return {"blink": self.blink, "gaze": self.gaze, "neck": self.neck}
+
+    @property
+    def driving(self) -> dict[str, Any]:
+        """How `drive` is opened; see `open_playback`."""
+        return {"template": self.template, "fps": self.fps, "sender": self.sender, "fill": self.fill}
 
     @property
     def picture_size(self) -> tuple[int, int]:
@@ -89,6 +104,15 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="neutral vertices for an .npy (.npy, .npz or .obj)",
     )
+    add(
+        "--sender",
+        type=Path,
+        metavar="RIG.npz",
+        help="rig of a live sender of another edition of FLAME than the avatar's (cap4d rig import flame)",
+    )
+    add("--no-blink", dest="blink", action="store_false", help="no blinks where a live source has none")
+    add("--no-gaze", dest="gaze", action="store_false", help="no glances where a live source has none")
+    add("--no-neck", dest="neck", action="store_false", help="no breathing neck where a live source has none")
     add("--fps", type=_rate, help=FPS_HELP)
     add("--backend", choices=("auto", "gl", "cpu"), default="auto", help="auto: gl where there is a GPU")
     add("--deformer", choices=DEFORMERS, default="auto", help=DEFORMER_HELP)

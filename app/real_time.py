@@ -14,7 +14,7 @@ from cap4d.app.play_clock import PlayClock
 
 from cap4d.drive.live import LiveStream
 from cap4d.player.avatar import Avatar
-from cap4d.player.camera_path import CameraPath, camera_path
+from cap4d.player.camera_path import CameraPath, live_camera_path
 from cap4d.player.offline import Draw, head_centre, statistics, write_stats
 from cap4d.player.video import VideoWriter, check_file, check_output
 
@@ -39,7 +39,7 @@ def record_live(
     if options.stats is not None:
         check_file(options.stats, "stats")
     size = options.picture_size
-    cameras = camera_path(options.camera, avatar.camera, head_centre(avatar), fps=fps, size=size)
+    cameras = live_camera_path(options.camera, avatar.camera, head_centre(avatar), fps=fps, size=size)
     several = options.frames or 2
     check_output(Path(out), fps=fps, frames=several, size=size)
     player = _Player(avatar, stream, cameras, draw)

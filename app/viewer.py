@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from cap4d.app.controls import Controls
 from cap4d.app.dropped import Use, use_of
 from cap4d.app.expressions import Expression, listed
 from cap4d.app.jobs import Jobs
-from cap4d.app.loading import Loaded, load_avatar, open_playback, with_deformer
+from cap4d.app.loading import ALL, Loaded, load_avatar, open_playback, with_deformer
 from cap4d.app.orbit import Orbit
 from cap4d.app.overlays.overlays import Overlay, Part
 from cap4d.app.overrides import Overrides
@@ -28,15 +28,14 @@ from cap4d.app.soundtrack import Soundtrack
 from cap4d.app.timings import Timings
 from cap4d.app.toasts import Toasts
 
-from cap4d.camera import Camera, head_fixed
+from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.errors import Cap4dError
 from cap4d.player.avatar import Avatar
-from cap4d.player.camera_path import camera_path, fitted
+from cap4d.player.camera_path import STANDING, camera_path, fitted, with_live_head
 
 Clock = Callable[[], float]
 
-NEAR_METRES = 0.25
 WINDOW_ACTIONS = (Action.SCREENSHOT, Action.RECORD, Action.QUIT, Action.FULLSCREEN)
 """What only the window can do; it takes them from `Viewer.asked`."""
 
@@ -47,6 +46,7 @@ class Viewer:
     Args:
         loaded: The avatar.
         playback: What drives it; closed with the viewer or when another takes its place.
+        fill: Which fillers live sources get; see `open_playback`.
         camera: See `camera_path`.
         deformer: What the user asked for; `auto` is found once the first picture is there.
         recent: The files opened lately.
@@ -60,6 +60,7 @@ class Viewer:
         loaded: Loaded,
         playback: Playback,
         *,
+        fill: Mapping[str, bool] = ALL,
         camera: str = "static",
         deformer: str = "auto",
         recent: RecentFiles,
@@ -68,6 +69,7 @@ class Viewer:
         executor: Executor | None = None,
     ) -> None:
         self.loaded, self.playback, self.recent, self.clock = loaded, playback, recent, clock
+        self.fill = fill
         self.camera_spec, self.wanted_deformer = camera, deformer
         self.toasts, self.timings, self.quality = Toasts(), Timings(), Quality()
         self.jobs = Jobs(self.fail, executor)
@@ -119,10 +121,9 @@ class Viewer:
         size = max(size[0], 1), max(size[1], 1)
         orbit = self.controls.orbit
         camera = orbit.camera(*size) if orbit is not None else fitted(self._path_camera(frame), size)
-        viewmat = self.overrides.turned(camera.viewmat, self.loaded.centre)
-        if self.playback.is_live and self.camera_spec in ("static", "orbit"):
-            viewmat = _with_live_head(viewmat, frame)
-        return replace(camera, viewmat=viewmat)
+        camera = replace(camera, viewmat=self.overrides.turned(camera.viewmat, self.loaded.centre))
+        stands = self.playback.is_live and self.camera_spec in STANDING
+        return with_live_head(camera, frame) if stands else camera
 
     def settle(self) -> None:
         """Finds the deformer that suits this machine, if that is still to be done."""
@@ -189,7 +190,7 @@ class Viewer:
         def open_it() -> Playback:
             if before.is_live:
                 before.close()  # the next one may listen to the same address
-            return open_playback(spec, bundle)
+            return open_playback(spec, bundle, fill=self.fill)
 
         self.jobs.start(f"Opening {name}", open_it, lambda playback: self._play(playback, spec))
 
@@ -275,16 +276,6 @@ class Viewer:
         """The view of the path at this moment, for the user to take over."""
         self.playback.number(self.now)
         return Orbit.from_camera(self._path_camera(self.playback.frame()), self.loaded.centre)
-
-
-def _with_live_head(viewmat: np.ndarray, frame: Frame) -> np.ndarray:
-    """The head turned as a live source says. Where it stands is only taken over where that is near its own
-    place: a webcam's metres would take it out of the picture.
-    """
-    if frame.rot is None:
-        return viewmat
-    tra = np.zeros(3) if frame.tra is None or np.linalg.norm(frame.tra) > NEAR_METRES else frame.tra
-    return head_fixed(viewmat, frame.rot, tra)
 
 
 def _toggle(name: str) -> Callable[[Viewer], None]:

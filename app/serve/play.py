@@ -17,7 +17,7 @@ from cap4d.app.serve.studio import Studio
 
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
-from cap4d.player.camera_path import camera_path
+from cap4d.player.camera_path import camera_path, live_camera_path
 from cap4d.player.offline import head_centre, statistics, write_stats
 from cap4d.player.video import check_file
 
@@ -43,13 +43,14 @@ def play_page(path: Path, options: Options) -> None:
         check_file(options.stats, "stats")
     avatar = Avatar.load(path, deformer=options.deformer)
     with ExitStack() as stack:
-        playback = open_playback(options.drive, avatar.bundle, template=options.template, fps=options.fps)
+        playback = open_playback(options.drive, avatar.bundle, **options.driving)
         stack.callback(playback.close)
         avatar.check_rig(playback.rig_name)
         if playback.is_live:
             log.info("listening for frames on %s", playback.name)
         fps, centre = 1 / playback.interval, head_centre(avatar)
-        cameras = camera_path(options.camera, avatar.camera, centre, fps=fps, size=None)
+        path = live_camera_path if playback.is_live else camera_path
+        cameras = path(options.camera, avatar.camera, centre, fps=fps, size=None)
         studio = Studio(
             avatar,
             Performance(playback, avatar.bundle),

@@ -9,7 +9,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,10 @@ from cap4d.app.serve.painter import Painter, choose_painter
 from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.watcher import Shot, Watcher
 
-from cap4d.camera import Camera, head_fixed
+from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.player.avatar import Avatar
-from cap4d.player.camera_path import CameraPath, fitted
+from cap4d.player.camera_path import CameraPath, fitted, with_live_head
 from cap4d.player.offline import head_centre
 
 log = logging.getLogger(__name__)
@@ -243,9 +242,8 @@ class Studio:
     def _camera(self, shot: Shot, frame: Frame, moment: Moment) -> Camera:
         if shot.orbit is not None:
             camera = shot.orbit.camera(*shot.size)
-        else:
-            camera = fitted(self.cameras(moment[0], frame), shot.size)
-        return turned(camera, frame) if self.performance.is_live else camera
+            return with_live_head(camera, frame) if self.performance.is_live else camera
+        return fitted(self.cameras(moment[0], frame), shot.size)
 
     def _nap(self, now: float) -> float:
         """s until something may be due by itself; whoever comes or says something ends it."""
@@ -254,13 +252,6 @@ class Studio:
         sharpen = min((t for w in self._watchers if (t := w.sharpens_at()) > now), default=now + LONGEST_NAP)
         due = min(self.performance.due(), sharpen)
         return min(max(due - now, 1e-3), LONGEST_NAP)
-
-
-def turned(camera: Camera, frame: Frame) -> Camera:
-    """The camera that sees a live head turn. One with a place in a world of its own (`tra`) has none here."""
-    if frame.rot is None or frame.tra is None or frame.tra.any():
-        return camera
-    return replace(camera, viewmat=head_fixed(camera.viewmat, frame.rot, frame.tra))
 
 
 def picture_message(head: dict[str, Any], jpeg: bytes, watcher: Watcher, shot: Shot) -> bytes:

@@ -12,6 +12,7 @@ from cap4d.drive.convert import Converter
 from cap4d.drive.live import Fill, LiveStream
 from cap4d.drive.packet import Receiver
 from cap4d.errors import ArgumentError
+from cap4d.rig.store import load_rig
 
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORTS = {"livelink": 11111, "vmc": 39539}  # what the senders send to, unless told otherwise
@@ -30,6 +31,7 @@ def open_live(
     *,
     template: Path | None = None,
     fps: float | None = None,
+    sender: Path | None = None,
     fillers: Fill | None = None,
 ) -> LiveStream:
     """Opens a live source for an avatar; it receives while the stream is used as a context.
@@ -42,17 +44,18 @@ def open_live(
         bundle: The avatar.
         template: Neutral vertices of senders of vertices; see `open_source`.
         fps: None: live frames bear stamps.
+        sender: Rig of a sender of another edition of FLAME; see `Converter`.
         fillers: See `LiveStream`.
     Raises:
         ArgumentError: No such source, an address that cannot be used, or one that is open to anybody.
-        DataError: The template is not sound.
+        DataError: The template or the rig is not sound.
         ModuleNotFoundError: A package that the source needs is not installed.
     """
     if fps is not None:
         raise ArgumentError(f"fps: expected none for a live source, whose frames bear stamps, got {fps:g}")
     if template is not None and spec != "-" and _scheme(spec) not in WIRE:
         raise ArgumentError(f"template: goes with senders of vertices (-, tcp, udp, ws), got {spec}")
-    convert = Converter(bundle, template=template)
+    convert = Converter(bundle, template=template, sender=None if sender is None else load_rig(sender))
     return LiveStream(_receiver(spec, bundle), convert, fillers)
 
 

@@ -14,8 +14,11 @@ from cap4d.errors import ArgumentError, DataError
 from cap4d.rig.npz import checked, read_npz
 
 ORBIT_YAW, ORBIT_PITCH, ORBIT_SECONDS = 55.0, 20.0, 8.0  # degrees and s (fact 51)
+NEAR_METRES = 0.25  # of a live head from its own place
 MAX_SIDE = 16384  # px
 CAMERA_FIELDS = frozenset({"extr", "fx", "fy", "cx", "cy", "resolution", "resolutions"})
+
+STANDING = ("static", "orbit")  # paths in the head-fixed world
 
 CameraPath = Callable[[int, Frame], Camera]
 """(number of the frame, the driven frame) -> camera in the head-fixed world."""
@@ -83,6 +86,28 @@ def file_path(path: Path, size: tuple[int, int] | None) -> CameraPath:
         return replace(camera, viewmat=head_fixed(camera.viewmat, frame.rot, frame.tra))
 
     return at
+
+
+def live_camera_path(
+    spec: str, default: Camera, target: np.ndarray, *, fps: float, size: tuple[int, int] | None
+) -> CameraPath:
+    """`camera_path` for a source that comes live: every path sees the head turn."""
+    path = camera_path(spec, default, target, fps=fps, size=size)
+    if spec not in STANDING:
+        return path  # cameras in the head's own world, whose pose they fold in
+    return lambda index, frame: with_live_head(path(index, frame), frame)
+
+
+def with_live_head(camera: Camera, frame: Frame) -> Camera:
+    """The same view of a head that turns as a live source says (fact 31).
+
+    Where it stands (`tra`) is only taken over where that is near the head's own place: a webcam's metres
+    would take it out of the picture.
+    """
+    if frame.rot is None:
+        return camera
+    tra = np.zeros(3) if frame.tra is None or np.linalg.norm(frame.tra) > NEAR_METRES else frame.tra
+    return replace(camera, viewmat=head_fixed(camera.viewmat, frame.rot, tra))
 
 
 def fitted(camera: Camera, size: tuple[int, int] | None) -> Camera:

@@ -57,3 +57,10 @@ def test_help_has_examples_and_keys(capsys):
     text = capsys.readouterr().out
     assert "cap4d-view me.cap4d --headless --frames 120 --out out.mp4" in text
     assert "space pause" in text
+
+
+def test_fillers_and_the_sender_go_to_what_opens_a_live_source():
+    options = parse_options(["--drive", "tcp://:9000", "--no-blink", "--no-neck", "--sender", "flame.npz"])
+    assert options.fill == {"blink": False, "gaze": True, "neck": False}
+    driving = {"template": None, "fps": None, "sender": Path("flame.npz"), "fill": options.fill}
+    assert options.driving == driving

@@ -203,7 +203,7 @@ def test_a_live_source_takes_the_clips_place_and_gives_it_back(show, monkeypatch
     viewer = show()
     stream = Stream(Frame(0.0, RIG_NAME, *(np.zeros(n, np.float32) for n in (5, 3, 3, 3))))
     live = StreamPlayback(stream, rig_name=RIG_NAME)
-    monkeypatch.setattr("cap4d.app.viewer.open_playback", lambda spec, _: live if spec else clip)
+    monkeypatch.setattr("cap4d.app.viewer.open_playback", lambda spec, _, **_settings: live if spec else clip)
     clip = ClipPlayback(viewer.avatar.idle, 0.0)
     viewer.drive("tcp://127.0.0.1:9000")
     viewer.poll()
@@ -245,7 +245,7 @@ def test_a_real_live_source_over_a_socket(show):
 def test_another_rigs_clip_is_refused(show, files, monkeypatch):
     viewer = show()
     foreign = ClipPlayback(replace(viewer.avatar.idle, rig_name="other"), 0.0)
-    monkeypatch.setattr("cap4d.app.viewer.open_playback", lambda *_: foreign)
+    monkeypatch.setattr("cap4d.app.viewer.open_playback", lambda *_, **_settings: foreign)
     playback = viewer.playback
     viewer.drive("other.npz")
     viewer.poll()
