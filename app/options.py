@@ -111,7 +111,7 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="?",
         const=SERVE,
         metavar="HOST:PORT",
-        help=f"no window: a page for browsers, which pictures of at most --size are sent to (default: {SERVE})",
+        help=f"no window: a page for browsers, with pictures of at most --size (default: {SERVE})",
     )
     add("--token", metavar="X", help="what --serve asks for (default: made up where others can reach it)")
     return parser

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import re
 import shutil
 import subprocess
 import time
@@ -102,11 +101,9 @@ def browser(folder: Path) -> Iterator[Page]:
     from websockets.sync.client import connect
 
     command = [chromium(), *FLAGS, f"--user-data-dir={folder}", "--remote-debugging-port=0", "about:blank"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     try:
-        address = next(
-            match[1] for line in process.stderr if (match := re.match(r"DevTools listening on (\S+)", line))
-        )
+        address = _address(folder, process)
         with connect(address, max_size=None, compression=None, proxy=None) as socket:
             yield Page(socket, _attach(socket))
             socket.send(json.dumps({"id": 0, "method": "Browser.close"}))
@@ -114,7 +111,16 @@ def browser(folder: Path) -> Iterator[Page]:
     finally:
         process.kill()
         process.wait()
-        process.stderr.close()
+
+
+def _address(folder: Path, process: subprocess.Popen) -> str:
+    """Where the browser listens, as it writes into its profile: a port, and a path on the next line."""
+    file, until = folder / "DevToolsActivePort", time.monotonic() + START_SECONDS
+    while not file.is_file() or len(lines := file.read_text().split()) < 2:
+        assert process.poll() is None, f"Chromium ended with code {process.returncode}"
+        assert time.monotonic() < until, f"Chromium did not listen within {START_SECONDS:g} s"
+        time.sleep(0.05)
+    return f"ws://127.0.0.1:{lines[0]}{lines[1]}"
 
 
 def _attach(socket) -> str:

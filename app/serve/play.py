@@ -5,19 +5,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from cap4d.app.loading import open_playback
 from cap4d.app.options import Options
 from cap4d.app.serve.gate import Gate, parse_address
-from cap4d.app.serve.performance import ClipTime, Performance, StreamTime
+from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.server import PageServer
 from cap4d.app.serve.studio import Studio
 
-from cap4d.drive.fillers import Fillers
-from cap4d.drive.open_live import is_live, open_live
-from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import camera_path
@@ -46,11 +43,16 @@ def play_page(path: Path, options: Options) -> None:
         check_file(options.stats, "stats")
     avatar = Avatar.load(path, deformer=options.deformer)
     with ExitStack() as stack:
-        source = _open(options, avatar, stack)
-        cameras = camera_path(options.camera, avatar.camera, head_centre(avatar), fps=source.fps, size=None)
+        playback = open_playback(options.drive, avatar.bundle, template=options.template, fps=options.fps)
+        stack.callback(playback.close)
+        avatar.check_rig(playback.rig_name)
+        if playback.is_live:
+            log.info("listening for frames on %s", playback.name)
+        fps, centre = 1 / playback.interval, head_centre(avatar)
+        cameras = camera_path(options.camera, avatar.camera, centre, fps=fps, size=None)
         studio = Studio(
             avatar,
-            Performance(source, avatar.bundle),
+            Performance(playback, avatar.bundle),
             cameras,
             backend=options.backend,
             area=math.prod(options.size or SIZE),
@@ -59,22 +61,6 @@ def play_page(path: Path, options: Options) -> None:
         studio.start()
         stack.callback(_finish, studio, options)
         serve_studio(studio, gate, port, title=path.stem)
-
-
-def _open(options: Options, avatar: Avatar, stack: ExitStack) -> ClipTime | StreamTime:
-    if not is_live(options.drive):
-        clip = open_source(options.drive, avatar.bundle, template=options.template, fps=options.fps)
-        avatar.check_rig(clip.rig_name)
-        return ClipTime(clip, time.monotonic())
-    stream = open_live(
-        options.drive,
-        avatar.bundle,
-        template=options.template,
-        fps=options.fps,
-        fillers=Fillers(avatar.bundle),
-    )
-    log.info("listening for frames on %s", stream.address)
-    return StreamTime(stack.enter_context(stream))
 
 
 def _finish(studio: Studio, options: Options) -> None:
@@ -104,12 +90,13 @@ def page_statistics(studio: Studio, size: tuple[int, int]) -> dict:
     """What `--stats` writes."""
     seconds = sum(studio.avatar.stages.seconds.get("frame", ()))
     found = statistics(studio.avatar, studio.moments, seconds, size=size, backend=studio.backend)
-    source = studio.performance.source
-    return found | {"serve": studio.statistics()} | ({"drive": source.statistics()} if source.is_live else {})
+    performance = studio.performance
+    found["serve"] = studio.statistics()
+    return found | ({"drive": dict(performance.statistics())} if performance.is_live else {})
 
 
 def check_options(options: Options) -> None:
     """Raises ArgumentError where `--serve` meets what it does not go with."""
-    for name in ("headless", "out", "frames", "pipeline"):
+    for name in ("headless", "out", "frames", "pipeline", "audio"):
         if getattr(options, name):
             raise ArgumentError(f"serve: goes without --{name}")

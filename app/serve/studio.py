@@ -95,7 +95,7 @@ class Studio:
     @property
     def failure(self) -> BaseException | None:
         """Why nothing new is drawn any more, if so."""
-        return self.error or self.performance.source.error
+        return self.error or self.performance.error
 
     @property
     def is_full(self) -> bool:
@@ -124,17 +124,17 @@ class Studio:
             if message.ack is not None:
                 self._acknowledge(watcher, message.ack, now)
             watcher.look(message, self._view)
-            before = performance.source.paused, performance.edits
+            before = performance.paused, performance.edits
             if message.play is not None:
-                performance.source.pause(not message.play, now)
+                performance.pause(not message.play, now)
             if message.seek is not None:
-                performance.source.seek(message.seek, now)
+                performance.seek(message.seek, now)
             if message.reset:
                 performance.release()
             for name, value in message.expr.items():
                 performance.hold(name, value)
             self._changed.notify()
-            return before != (performance.source.paused, performance.edits)
+            return before != (performance.paused, performance.edits)
 
     def stalled(self) -> list[Watcher]:
         """Those who have not shown what they were sent for too long."""
@@ -155,15 +155,15 @@ class Studio:
             "gaussians": len(bundle),
             "deformer": self.avatar.tier,
             "backend": self.backend,
-            "live": performance.source.is_live,
-            "duration": performance.source.duration,
+            "live": performance.is_live,
+            "duration": performance.duration,
             "expressions": sliders,
         }
 
     def state(self) -> dict[str, Any]:
         """What everybody shares."""
         with self._changed:
-            return {"paused": self.performance.source.paused, "held": dict(self.performance.held)}
+            return {"paused": self.performance.paused, "held": dict(self.performance.held)}
 
     def statistics(self) -> dict[str, Any]:
         """Of `--stats`: latencies from the begin of drawing to the echo that it is shown."""
@@ -183,8 +183,9 @@ class Studio:
     def _view(self) -> Orbit:
         """The camera path's place at this moment, for somebody to take over."""
         now = self.clock()
-        frame = self.performance.frame(now) if self._seen is None else self._seen
-        return Orbit.from_camera(self.cameras(self.performance.source.number(now), frame), self.centre)
+        number, _ = self.performance.number(now)
+        frame = self.performance.frame() if self._seen is None else self._seen
+        return Orbit.from_camera(self.cameras(number, frame), self.centre)
 
     # the thread -----------------------------------------------------------------------------------
 
@@ -213,15 +214,15 @@ class Studio:
             if not wanted:
                 self._changed.wait(self._nap(now))
                 return True
-            frame = self._seen = self.performance.frame(now)
-            position, stream = self.performance.source.position(now), self.performance.source.state
+            frame = self._seen = self.performance.frame()
+            position, stream = self.performance.position, self.performance.state
         with self.avatar.stages.time("frame"):
             pictures = self._paint(painter, encoder, frame, moment, set(wanted.values()))
         done = self.clock()
         head = {"at": round(position, 3), "stream": stream, "drawn": round((done - now) * 1e3, 2)}
         with self._changed:
             self.moments += 1
-            self.performance.source.drawn(done)
+            self.performance.drawn(done)
             for watcher, shot in wanted.items():
                 if watcher in self._watchers:
                     data = picture_message(head, pictures[shot], watcher, shot)
@@ -244,14 +245,14 @@ class Studio:
             camera = shot.orbit.camera(*shot.size)
         else:
             camera = fitted(self.cameras(moment[0], frame), shot.size)
-        return turned(camera, frame) if self.performance.source.is_live else camera
+        return turned(camera, frame) if self.performance.is_live else camera
 
     def _nap(self, now: float) -> float:
         """s until something may be due by itself; whoever comes or says something ends it."""
         if not self._watchers:
             return LONGEST_NAP
         sharpen = min((t for w in self._watchers if (t := w.sharpens_at()) > now), default=now + LONGEST_NAP)
-        due = min(self.performance.source.due(now), sharpen)
+        due = min(self.performance.due(), sharpen)
         return min(max(due - now, 1e-3), LONGEST_NAP)
 
 
@@ -265,8 +266,8 @@ def turned(camera: Camera, frame: Frame) -> Camera:
 def picture_message(head: dict[str, Any], jpeg: bytes, watcher: Watcher, shot: Shot) -> bytes:
     """u32 length of the head (little-endian), the head as JSON, the JPEG.
 
-    The head: `n` the picture's number, to be echoed when it is shown; `at` s in the clip; `stream` a live stream's state; `drawn` ms;
-    `latency` ms, median of late; `size`; `quantiser`.
+    The head: `n` the picture's number, to be echoed when it is shown; `at` s in the clip; `stream` a live
+    stream's state; `drawn` ms; `latency` ms, median of late; `size`; `quantiser`.
     """
     latency = watcher.pace.latency
     mine = {

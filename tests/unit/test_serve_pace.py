@@ -7,10 +7,11 @@ import io
 import numpy as np
 import pytest
 from cap4d.app.orbit import Orbit
+from cap4d.app.playback import ClipPlayback, StreamPlayback
 from cap4d.app.serve.jpeg import JpegEncoder
 from cap4d.app.serve.message import Message
 from cap4d.app.serve.pace import IN_FLIGHT, LEVELS, STALLED, Pace
-from cap4d.app.serve.performance import ClipTime, Performance, StreamTime
+from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.watcher import SHARPEN_SECONDS, Watcher, fitted_size
 
 from cap4d.drive.clip import Clip, Frame
@@ -169,42 +170,72 @@ def test_a_jpeg_holds_the_picture():
     assert data[3] == data[0]
 
 
-# the clock of what plays ---------------------------------------------------------------------------
+# what plays ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bundle():
+    pytest.importorskip("onnx")
+    from tiny_bundle import tiny_bundle
+
+    return tiny_bundle(8, network=False)
 
 
 def clip(frames: int = 10, fps: float = 10.0) -> Clip:
     zeros = np.zeros((frames, 3), np.float32)
-    return Clip("tiny", fps, np.arange(frames, dtype=np.float32)[:, None], zeros, zeros, zeros)
+    expr = np.zeros((frames, 5), np.float32)
+    expr[:, 4] = np.arange(frames)
+    return Clip("tiny", fps, expr, zeros, zeros, zeros)
 
 
-def test_a_clip_plays_its_own_frames_on_the_clock_again_and_again():
-    time = ClipTime(clip(), 100.0)
-    assert [float(time.frame(100 + i / 10).expr[0]) for i in range(12)] == [*range(10), 0, 1]
-    assert float(time.frame(100.19).expr[0]) == 1.0
-    assert time.due(100.15) == pytest.approx(100.2)
-    assert time.position(101.3) == pytest.approx(0.3)
+def face(performance: Performance, now: float) -> float:
+    performance.number(now)
+    return float(performance.frame().expr[4])
 
 
-def test_a_clip_stands_goes_on_and_moves():
-    time = ClipTime(clip(), 100.0)
-    time.pause(True, 100.35)
-    assert time.number(150.0) == 3
-    assert time.due(150.0) == float("inf")
-    time.pause(False, 200.0)
-    assert time.number(200.2) == 5
-    time.seek(0.8, 300.0)
-    assert [time.number(300.0), time.number(300.1)] == [8, 9]
-    time.pause(True, 300.0)
-    time.seek(99.0, 300.0)
-    assert time.number(400.0) == 9
+def test_a_clip_plays_its_own_frames_on_the_clock_again_and_again(bundle):
+    performance = Performance(ClipPlayback(clip(), 100.0), bundle)
+    assert [face(performance, 100.01 + i / 10) for i in range(12)] == [*range(10), 0, 1]
+    assert performance.due() == pytest.approx(101.2)
+    assert performance.position == pytest.approx(0.1)
+    assert (performance.is_live, performance.duration, performance.state) == (False, 1.0, "")
+
+
+def test_a_clip_stands_goes_on_and_moves(bundle):
+    performance = Performance(ClipPlayback(clip(), 100.0), bundle)
+    assert face(performance, 100.35) == 3
+    performance.pause(True, 100.35)
+    performance.pause(True, 100.36)
+    assert face(performance, 150.0) == 3
+    assert performance.due() == float("inf")
+    performance.pause(False, 200.0)
+    assert face(performance, 200.21) == 5
+    performance.seek(0.8, 300.0)
+    assert [face(performance, now) for now in (300.0, 300.11)] == [8, 9]
+    performance.pause(True, 300.11)
+    performance.seek(99.0, 300.2)
+    assert face(performance, 400.0) == 9
+
+
+def test_a_clip_of_a_thousand_frames_a_second_is_not_drawn_so_often(bundle):
+    performance = Performance(ClipPlayback(clip(4000, 1000.0), 100.0), bundle)
+    numbers = {performance.number(100 + i / 2000) for i in range(2000)}
+    assert 55 <= len(numbers) <= 69
 
 
 class FakeStream:
-    state, error = "playing", None
+    """Moves with the time it is asked at."""
+
+    state, error, address = "playing", None, "tcp://127.0.0.1:1"
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_) -> None: ...
 
     def frame(self, now: float) -> Frame:
         zero = np.zeros(3, np.float32)
-        return Frame(now, "tiny", np.float32([now]), zero, zero, zero)
+        return Frame(now, "tiny", np.float32([0, 0, 0, 0, now]), zero, zero, zero)
 
     def shown(self, now: float) -> None: ...
 
@@ -212,29 +243,35 @@ class FakeStream:
         return {"received": 3}
 
 
-def test_a_stream_is_frozen_and_goes_on():
-    time = StreamTime(FakeStream())
-    assert time.frame(1.0).t == 1.0
-    time.pause(True, 1.0)
-    assert time.frame(2.0).t == 1.0
-    assert time.number(1.0) == time.number(9.0)
-    time.pause(False, 3.0)
-    assert time.frame(3.0).t == 3.0
+def test_a_stream_is_frozen_and_goes_on(bundle):
+    performance = Performance(StreamPlayback(FakeStream(), rig_name="tiny"), bundle)
+    assert face(performance, 1.0) == 1.0
+    performance.pause(True, 1.0)
+    before = performance.number(1.0)
+    assert face(performance, 2.0) == 1.0
+    assert performance.number(9.0) == before
+    performance.pause(False, 9.0)
+    assert face(performance, 9.1) == pytest.approx(9.1)
+    performance.seek(3.0, 9.2)
+    assert (performance.is_live, performance.duration, performance.state) == (True, 0.0, "playing")
 
 
-def test_held_expressions_stay_within_their_range_and_let_go():
-    pytest.importorskip("onnx")
-    from tiny_bundle import tiny_bundle
+def test_a_stream_is_looked_at_thirty_times_a_second(bundle):
+    performance = Performance(StreamPlayback(FakeStream(), rig_name="tiny"), bundle)
+    numbers = {performance.number(100 + i / 1000) for i in range(1000)}
+    assert 29 <= len(numbers) <= 32
 
-    bundle = tiny_bundle(8, network=False)
-    performance = Performance(ClipTime(bundle.idle, 0.0), bundle)
-    before = performance.frame(0.0).expr.copy()
+
+def test_held_expressions_stay_within_their_range_and_let_go(bundle):
+    performance = Performance(ClipPlayback(bundle.idle, 0.0), bundle)
+    assert performance.number(0.0) == (0, 0)
+    before = performance.frame().expr.copy()
     performance.hold("jawOpen", 7.0)
     performance.hold("no such", 1.0)
     assert performance.number(0.0) == (0, 1)
-    held = performance.frame(0.0).expr
+    held = performance.frame().expr
     assert held[0] == 1.0
     np.testing.assert_array_equal(held[1:], before[1:])
     np.testing.assert_array_equal(bundle.idle.expr[0], before)
     performance.release()
-    np.testing.assert_array_equal(performance.frame(0.0).expr, before)
+    np.testing.assert_array_equal(performance.frame().expr, before)

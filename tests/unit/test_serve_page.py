@@ -25,11 +25,12 @@ pytest.importorskip("websockets")
 pytest.importorskip("onnx")
 
 from cap4d.app.main import main
+from cap4d.app.playback import ClipPlayback
 from cap4d.app.serve import server as server_module
 from cap4d.app.serve.gate import Gate
 from cap4d.app.serve.jpeg import JpegEncoder
 from cap4d.app.serve.message import parse_message
-from cap4d.app.serve.performance import ClipTime, Performance
+from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.server import PageServer
 from cap4d.app.serve.studio import Studio
 from chromium import browser, chromium
@@ -49,7 +50,7 @@ PATIENCE = 20.0  # s that anything may take on a busy machine
 def tiny_studio(*, limit: int = 4, clock: Callable[[], float] = time.monotonic) -> Studio:
     """Not started."""
     bundle = tiny_bundle(network=False)
-    performance = Performance(ClipTime(bundle.idle, clock()), bundle)
+    performance = Performance(ClipPlayback(bundle.idle, clock()), bundle)
     cameras = camera_path("static", bundle.camera, np.zeros(3), fps=24, size=None)
     avatar = Avatar(bundle, deformer="off", threads=1)
     return Studio(avatar, performance, cameras, backend="cpu", area=128 * 128, limit=limit, clock=clock)
