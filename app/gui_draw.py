@@ -87,8 +87,10 @@ class GuiDraw:
             buffer.write(content)
 
 
-def _bytes(buffer: object, item_size: int) -> bytes:
-    return ctypes.string_at(buffer.data_address(), buffer.size() * item_size) if buffer.size() else b""
+def _bytes(buffer: object, item_size: int) -> memoryview:
+    """Dear ImGui's own memory, valid until its next frame."""
+    size = buffer.size() * item_size
+    return memoryview((ctypes.c_char * size).from_address(buffer.data_address())) if size else memoryview(b"")
 
 
 def _scissor(clip: imgui.ImVec4, data: imgui.ImDrawData) -> tuple[int, int, int, int]:

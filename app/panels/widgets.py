@@ -54,6 +54,10 @@ def bar(
     Returns:
         The new value, or None where the user did nothing.
     """
+    size = ImVec2(width, imgui.get_frame_height())
+    if not imgui.is_rect_visible(size):  # scrolled away: most bars of a long list are
+        imgui.dummy(size)
+        return None
     typing = imgui.internal.temp_input_is_active(imgui.get_id(f"##{key}"))
     hidden = HIDDEN_GRAB if typing else (*HIDDEN_GRAB, imgui.Col_.text)
     for part in hidden:
@@ -61,7 +65,7 @@ def bar(
     imgui.set_next_item_width(width)
     changed, wanted = imgui.slider_float(f"##{key}", value, low, high, "%.3f", SLIDER)
     imgui.pop_style_color(len(hidden))
-    if not typing and imgui.is_item_visible():
+    if not typing:
         _paint_bar(text, wanted if changed else value, low, high, held, number)
     return wanted if changed else None
 
