@@ -49,8 +49,8 @@ def play_page(path: Path, options: Options) -> None:
         if playback.is_live:
             log.info("listening for frames on %s", playback.name)
         fps, centre = 1 / playback.interval, head_centre(avatar)
-        path = live_camera_path if playback.is_live else camera_path
-        cameras = path(options.camera, avatar.camera, centre, fps=fps, size=None)
+        choose = live_camera_path if playback.is_live else camera_path
+        cameras = choose(options.camera, avatar.camera, centre, fps=fps, size=None)
         studio = Studio(
             avatar,
             Performance(playback, avatar.bundle),
