@@ -9,14 +9,29 @@ from cap4d.errors import ArgumentError, Cap4dError, DataError
 
 if TYPE_CHECKING:
     from cap4d.camera import Camera
+    from cap4d.drive.open_live import open_live
     from cap4d.gaussians import Gaussians
     from cap4d.player.avatar import Avatar
 
 __version__ = "0.1.0"
-__all__ = ["ArgumentError", "Avatar", "Camera", "Cap4dError", "DataError", "Gaussians", "__version__"]
+__all__ = [
+    "ArgumentError",
+    "Avatar",
+    "Camera",
+    "Cap4dError",
+    "DataError",
+    "Gaussians",
+    "__version__",
+    "open_live",
+]
 
 # Imported when first asked for: onnxruntime takes 0.2 s, and programs choose NumPy's threads before it loads.
-LAZY = {"Avatar": "cap4d.player.avatar", "Camera": "cap4d.camera", "Gaussians": "cap4d.gaussians"}
+LAZY = {
+    "Avatar": "cap4d.player.avatar",
+    "Camera": "cap4d.camera",
+    "Gaussians": "cap4d.gaussians",
+    "open_live": "cap4d.drive.open_live",
+}
 
 
 def __getattr__(name: str) -> Any:
