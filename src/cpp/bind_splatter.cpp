@@ -41,14 +41,21 @@ class PySplatter {
     draw_alone(view, threads, Image8{out.mutable_data(), alpha});
   }
 
+  // The picture's size is asked for and counted into in one go: another thread may draw one of another size.
   void count_pixels(py::array_t<std::uint16_t, py::array::c_style> out, int threads) {
-    const Camera& camera = splatter_.last().camera;
-    if (splatter_.last().lists.offsets.get() == nullptr) throw std::invalid_argument("count: expected a picture that was drawn, got none");
-    expect(out, "out", {camera.height, camera.width});
+    if (out.ndim() != 2) throw std::invalid_argument("out: expected uint16[H, W]");
     std::uint16_t* to = out.mutable_data();
-    py::gil_scoped_release release;
-    std::lock_guard lock(busy_);
-    splatter_.count(threads, to);
+    const py::ssize_t height = out.shape(0), width = out.shape(1);
+    Camera last;
+    bool drawn;
+    {
+      py::gil_scoped_release release;
+      std::lock_guard lock(busy_);
+      last = splatter_.last().camera, drawn = splatter_.last().lists.offsets.get() != nullptr;
+      if (drawn && height == last.height && width == last.width) return splatter_.count(threads, to);
+    }
+    if (!drawn) throw std::invalid_argument("count: expected a picture that was drawn, got none");
+    expect(out, "out", {last.height, last.width});
   }
 
   py::array_t<std::uint32_t> order(DoubleArray viewmat, std::optional<FloatArray> vertices, int threads) {
