@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,6 +169,11 @@ class Converter:
         except Rejected:
             return np.zeros(len(self._names), np.float32), np.zeros(3, np.float32), np.zeros(3, np.float32)
         return arkit(np.zeros(arkit.expr.shape[1], np.float32))
+
+    def prepare(self) -> None:
+        """Works out now what the first frame of vertices would wait for (0.15 s), and those behind it."""
+        with suppress(Rejected):
+            self._vertex_map()
 
     def _vertex_map(self) -> Retargeter:
         if self._retargeter is None:

@@ -56,7 +56,10 @@ def open_live(
     if template is not None and spec != "-" and _scheme(spec) not in WIRE:
         raise ArgumentError(f"template: goes with senders of vertices (-, tcp, udp, ws), got {spec}")
     convert = Converter(bundle, template=template, sender=None if sender is None else load_rig(sender))
-    return LiveStream(_receiver(spec, bundle), convert, fillers)
+    receiver = _receiver(spec, bundle)
+    if spec == "-" or _scheme(spec) in WIRE:
+        convert.prepare()  # a first frame that takes long would look like a line that does, for ten seconds
+    return LiveStream(receiver, convert, fillers)
 
 
 @dataclass(frozen=True)

@@ -115,3 +115,12 @@ def test_a_package_that_is_missing_is_named_with_its_extra(bundle, monkeypatch, 
     monkeypatch.setitem(sys.modules, "websockets", None)
     assert exit_code("cap4d-view", lambda: open_live("ws://:0", bundle)) == 2
     assert "cap4d[live]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("spec", ["tcp://:0", "udp://:0"])
+def test_the_first_frame_of_vertices_finds_its_retargeter_there(spec, bundle, monkeypatch) -> None:
+    built = []
+    monkeypatch.setattr("cap4d.drive.convert.Retargeter", lambda *_: built.append(1) or object())
+    with open_live(spec, bundle):
+        pass
+    assert built == [1]
