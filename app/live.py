@@ -47,8 +47,15 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     player = LivePlayer(window, viewer, options.backend)
     try:
         player.run(options.frames)
+    except KeyboardInterrupt:  # a live source is often ended so: what was measured counts
+        _write_stats(player, options)
+        raise
     finally:
         player.close()
+    _write_stats(player, options)
+
+
+def _write_stats(player: LivePlayer, options: Options) -> None:
     if options.stats is not None:
         write_stats(options.stats, player.statistics())
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cap4d.errors import ArgumentError
+from cap4d.parser import OneLineParser
 
 EXAMPLES = """examples:
   cap4d-view                                   the built-in demo avatar, in a window
@@ -89,7 +90,7 @@ def parse_options(argv: Sequence[str] | None = None) -> Options:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="cap4d-view",
         description="Plays a 4D avatar live in a window, or renders it to a file.",
         epilog=EXAMPLES,

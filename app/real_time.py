@@ -16,6 +16,7 @@ from cap4d.drive.live import LiveStream
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import CameraPath, live_camera_path
 from cap4d.player.offline import Draw, head_centre, statistics, write_stats
+from cap4d.player.sound import Sound
 from cap4d.player.video import VideoWriter, check_file, check_output
 
 log = logging.getLogger(__name__)
@@ -41,12 +42,13 @@ def record_live(
     size = options.picture_size
     cameras = live_camera_path(options.camera, avatar.camera, head_centre(avatar), fps=fps, size=size)
     several = options.frames or 2
-    check_output(Path(out), fps=fps, frames=several, size=size)
+    check_output(Path(out), fps=fps, frames=several, size=size, sound=options.audio is not None)
+    sound = None if options.audio is None else Sound.load(options.audio)
     player = _Player(avatar, stream, cameras, draw)
     player.draw(0)  # loads what the others find loaded
     avatar.stages.clear()
     log.info("listening at %s", stream.address)
-    with VideoWriter(out, fps=fps) as writer:
+    with VideoWriter(out, fps=fps, sound=sound) as writer:
         clock = PlayClock(fps, time.monotonic())
         start = time.perf_counter()
         try:

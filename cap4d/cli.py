@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cap4d.errors import exit_code
+from cap4d.parser import OneLineParser
 
 EXAMPLES = """examples:
   cap4d demo                                          # the built-in head, built once, then played
@@ -50,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="cap4d",
         description="Photos or a video of a person in, a live 4D avatar out.",
         epilog=EXAMPLES,

@@ -21,8 +21,8 @@ LIVE = "-, tcp://, udp://, ws://, livelink://, vmc:// or webcam://"
 
 
 def is_live(spec: str | None) -> bool:
-    """Whether that is one of the sources that `open_live` opens, rather than a file."""
-    return spec == "-" or (spec is not None and _scheme(spec) in (*WIRE, *DEFAULT_PORTS, "webcam"))
+    """Whether that is for `open_live`, an address of whatever kind, rather than a file."""
+    return spec == "-" or (spec is not None and "://" in spec)
 
 
 def open_live(
@@ -115,7 +115,7 @@ def _receiver(spec: str, bundle: Bundle) -> Receiver:
         return _wire_receiver(scheme, parse_address(spec))
     if scheme in DEFAULT_PORTS:
         return _datagram_receiver(scheme, parse_address(spec))
-    raise ArgumentError(f"drive: expected {LIVE}, got {spec}")
+    raise ArgumentError(f"drive: expected {LIVE}, or a file, got {spec}")
 
 
 def _wire_receiver(scheme: str, address: Address) -> Receiver:

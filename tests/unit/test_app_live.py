@@ -1,5 +1,6 @@
 """The playing window: its loop on a framebuffer of our own, its input, and the real thing under Xvfb."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -13,9 +14,10 @@ import pytest
 from cap4d.app.controls import Drag
 from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.layout import Rect
-from cap4d.app.live import LivePlayer, choose_renderer
+from cap4d.app.live import LivePlayer, choose_renderer, play_live
 from cap4d.app.loading import Loaded
 from cap4d.app.panels.notes import WELCOME
+from cap4d.app.options import parse_options
 from cap4d.app.playback import ClipPlayback
 from cap4d.app.recent import RecentFiles
 from cap4d.app.renderers import CpuRenderer, GlRenderer
@@ -417,6 +419,28 @@ def test_no_display_is_one_line(monkeypatch):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(DisplayUnavailableError, match="expected a display, found none"):
         Window("test", 64, 64)
+
+
+def test_ctrl_c_keeps_what_was_measured(tmp_path, monkeypatch):
+    class Interrupted:
+        def __init__(self, *_):
+            pass
+
+        def run(self, frames):
+            raise KeyboardInterrupt
+
+        def close(self):
+            pass
+
+        def statistics(self):
+            return {"frames": 3}
+
+    monkeypatch.setattr("cap4d.app.live.open_viewer", lambda *_: None)
+    monkeypatch.setattr("cap4d.app.live.LivePlayer", Interrupted)
+    stats = tmp_path / "stats.json"
+    with pytest.raises(KeyboardInterrupt):
+        play_live(tmp_path / "a.cap4d", parse_options(["--stats", str(stats)]), None)
+    assert json.loads(stats.read_text()) == {"frames": 3}
 
 
 WINDOW_PROGRAM = """

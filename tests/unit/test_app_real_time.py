@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from cap4d.app.main import main
 from tiny_bundle import EXPRESSIONS, RIG_NAME, tiny_bundle
+from wav_files import click, write_wav
 
 from cap4d.bundle import write_bundle
 from cap4d.drive.packet import Packet
@@ -94,10 +95,22 @@ def test_ctrl_c_ends_the_file_where_it_is(folder) -> None:
     assert json.loads((folder / "stats.json").read_text())["drive"]["state"] == "waiting"
 
 
+def test_a_sound_goes_into_the_file_of_a_live_source(folder) -> None:
+    import av
+
+    write_wav(folder / "a.wav", click(0.1, seconds=2), 48000)
+    assert view("--drive udp://127.0.0.1:0 --frames 15 --out out.mp4 --audio a.wav") == 0
+    with av.open("out.mp4") as container:
+        heard = np.concatenate([frame.to_ndarray().ravel() for frame in container.decode(audio=0)])
+    assert len(heard) / 48000 == pytest.approx(0.5, abs=0.1) and np.abs(heard).max() > 0.1
+
+
 @pytest.mark.parametrize(
     "options",
     [
         "--drive tcp://0.0.0.0:9000",
+        "--drive foo://127.0.0.1:9000",
+        "--drive tcp://127.0.0.1:0 --out frame_%03d.png --audio a.wav",
         "--drive udp://127.0.0.1:x",
         "--drive tcp://127.0.0.1:0 --pipeline",
         "--drive tcp://127.0.0.1:0 --out out.avi",

@@ -23,13 +23,13 @@ def bundle() -> Bundle:
 
 
 @pytest.mark.parametrize(
-    "spec", ["-", "tcp://:1", "udp://h:1", "ws://h:1", "livelink://h", "vmc://h", "webcam://0"]
+    "spec", ["-", "tcp://:1", "udp://h:1", "ws://h:1", "livelink://h", "vmc://h", "webcam://0", "http://x"]
 )
 def test_live_sources(spec) -> None:
     assert is_live(spec)
 
 
-@pytest.mark.parametrize("spec", [None, "", "fit.npz", "a.npy", "C:/a.npz", "http://x", "tcp", "tcp:1", "--"])
+@pytest.mark.parametrize("spec", [None, "", "fit.npz", "a.npy", "C:/a.npz", "tcp", "tcp:1", "--"])
 def test_files_are_not_live(spec) -> None:
     assert not is_live(spec)
 
