@@ -69,9 +69,13 @@ class Gate:
     Args:
         host: What is listened on.
         token: What a request must bear; None: nothing on loopback, one made up elsewhere.
+    Raises:
+        ArgumentError: The token is empty.
     """
 
     def __init__(self, host: str, token: str | None = None) -> None:
+        if token == "":  # as from a shell variable that is not set: it would let everybody in
+            raise ArgumentError("token: expected a word, got none")
         self.host, self.loopback = host, is_loopback(host)
         self.token = token if token is not None or self.loopback else secrets.token_urlsafe(16)
 
