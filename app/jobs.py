@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Job:
     label: str
-    future: Future[Any]
+    work: Callable[[], Any]
     done: Callable[[Any], None]
+    future: Future[Any] | None = None  # None: it did not begin
 
 
 class Jobs:
@@ -35,22 +36,30 @@ class Jobs:
         return self._waiting[0].label if self._waiting else None
 
     def start(self, label: str, work: Callable[[], Any], done: Callable[[Any], None]) -> None:
-        """Does `work` as soon as what was started before is through, then calls `done` in `poll`."""
-        self._waiting.append(_Job(label, self._executor.submit(work), done))
+        """Does `work` as soon as the result of what was started before is taken over, as `work` may build on
+        it; then calls `done` in `poll`."""
+        self._waiting.append(_Job(label, work, done))
+        self._begin()
 
     def poll(self) -> bool:
         """Takes over what has finished; whether anything has."""
         finished = 0
         while self._waiting and self._waiting[0].future.done():
-            job = self._waiting.popleft()
+            job = self._waiting[0]
             finished += 1
             try:
                 job.done(job.future.result())
             except Exception as error:  # whatever a file or a source did: the window goes on
                 self._on_error(error)
+            self._waiting.popleft()
+            self._begin()
         return finished > 0
 
     def close(self) -> None:
         """Starts nothing more, and waits for what runs."""
         self._executor.shutdown(wait=True, cancel_futures=True)
         self._waiting.clear()
+
+    def _begin(self) -> None:
+        if self._waiting and self._waiting[0].future is None:
+            self._waiting[0].future = self._executor.submit(self._waiting[0].work)

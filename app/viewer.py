@@ -184,13 +184,12 @@ class Viewer:
 
     def drive(self, spec: str | None) -> None:
         """Lets another source drive the avatar: a file, an address, or None for its own idle clip."""
-        bundle, before = self.loaded.bundle, self.playback
         name = "the idle clip" if spec is None else spec
 
         def open_it() -> Playback:
-            if before.is_live:
-                before.close()  # the next one may listen to the same address
-            return open_playback(spec, bundle, fill=self.fill)
+            if self.playback.is_live:
+                self.playback.close()  # the next one may listen to the same address
+            return open_playback(spec, self.loaded.bundle, fill=self.fill)
 
         self.jobs.start(f"Opening {name}", open_it, lambda playback: self._play(playback, spec))
 
@@ -245,7 +244,11 @@ class Viewer:
         self.controls.reset()
 
     def _play(self, playback: Playback, spec: str | None) -> None:
-        self.avatar.check_rig(playback.rig_name)
+        try:
+            self.avatar.check_rig(playback.rig_name)
+        except Cap4dError:
+            playback.close()  # a live one holds a thread and a port
+            raise
         self._replace_playback(playback)
         if spec is not None and not playback.is_live:
             self.recent.add(Path(spec))

@@ -16,8 +16,11 @@ def jobs():
 
 
 def finish(jobs):
-    jobs._executor.submit(lambda: None).result(10)  # one worker: what was started before is through
-    return jobs.poll()
+    finished = False
+    while jobs.label is not None:
+        jobs._executor.submit(lambda: None).result(10)  # one worker: what was begun before is through
+        finished |= jobs.poll()
+    return finished
 
 
 def test_work_is_done_elsewhere_and_its_result_taken_over_here(jobs):
@@ -40,6 +43,14 @@ def test_results_come_in_the_order_of_the_work(jobs):
     gate.set()
     finish(jobs)
     assert results == ["slow", "quick"]
+
+
+def test_work_begins_when_the_result_before_it_is_taken_over(jobs):
+    known = []
+    jobs.start("first", lambda: 1, known.append)
+    jobs.start("second", lambda: list(known), known.append)
+    finish(jobs)
+    assert known == [1, [1]]
 
 
 def test_what_goes_wrong_is_told_and_the_rest_goes_on(jobs):
