@@ -328,7 +328,7 @@ CLIP_ACTIONS: dict[Action, Callable[[Viewer, ClipPlayback], None]] = {
     Action.NEXT: lambda viewer, playback: playback.step(1, viewer.now),
     Action.PREVIOUS: lambda viewer, playback: playback.step(-1, viewer.now),
     Action.REWIND: lambda viewer, playback: playback.rewind(viewer.now),
-    Action.LOOP: lambda _, playback: setattr(playback, "loops", not playback.loops),
+    Action.LOOP: lambda viewer, playback: playback.set_loops(not playback.loops, viewer.now),
     Action.FASTER: _change_speed(1),
     Action.SLOWER: _change_speed(-1),
     Action.SMOOTH: lambda viewer, playback: playback.set_smooth(
