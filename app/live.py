@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Hashable
+from contextlib import ExitStack
 from pathlib import Path
 
 import moderngl
@@ -47,10 +48,10 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     player = LivePlayer(window, viewer, options.backend)
     try:
         player.run(options.frames)
+        if options.stats is not None:
+            write_stats(options.stats, player.statistics())
     finally:
         player.close()
-    if options.stats is not None:
-        write_stats(options.stats, player.statistics())
 
 
 def open_viewer(path: Path, options: Options) -> Viewer:
@@ -123,9 +124,10 @@ class LivePlayer:
 
     def close(self) -> None:
         """Ends what runs in the background, and Dear ImGui."""
-        self.taking.close()
-        self.viewer.close()
-        self.gui.release()
+        with ExitStack() as stack:  # all of it, even where a recording cannot be finished
+            stack.callback(self.gui.release)
+            stack.callback(self.viewer.close)
+            self.taking.close()
 
     def step(self) -> bool:
         """Shows what has changed; False if all of it is on screen already, or the window has no pixels."""
