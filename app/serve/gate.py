@@ -8,13 +8,13 @@ goes before everything.
 
 from __future__ import annotations
 
-import ipaddress
 import secrets
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.parse import parse_qs, urlencode, urlsplit
 
+from cap4d.drive.open_live import is_loopback
 from cap4d.drive.wire import same_token
 from cap4d.errors import ArgumentError
 
@@ -53,14 +53,6 @@ def parse_address(text: str) -> tuple[str, int]:
     if port is None or text != parts.netloc or "@" in text:
         raise ArgumentError(f"serve: expected HOST:PORT such as 127.0.0.1:8300, got {text}")
     return host, port
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches it; a name other than localhost counts as not."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 class Gate:

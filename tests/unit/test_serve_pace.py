@@ -276,5 +276,7 @@ def test_held_expressions_stay_within_their_range_and_let_go(bundle):
     assert held[0] == 1.0
     np.testing.assert_array_equal(held[1:], before[1:])
     np.testing.assert_array_equal(bundle.idle.expr[0], before)
-    performance.release()
+    assert performance.held == {"jawOpen": 1.0}
+    performance.overrides.reset()
+    assert performance.held == {}
     np.testing.assert_array_equal(performance.frame().expr, before)
