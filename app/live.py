@@ -306,6 +306,10 @@ class LivePlayer:
         self.taking.toggle_recording((width, height))
         self.gui.touch()
 
+    def _toggle_vsync(self) -> None:
+        self.viewer.has_vsync = not self.viewer.has_vsync
+        self.window.set_vsync(self.viewer.has_vsync)
+
     def _obey(self) -> None:
         """Does what the user asked of the window itself."""
         while self.viewer.asked:
@@ -318,3 +322,5 @@ class LivePlayer:
                     self._toggle_recording()
                 case Action.FULLSCREEN:
                     self.window.toggle_fullscreen()
+                case Action.VSYNC:
+                    self._toggle_vsync()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
@@ -36,7 +37,7 @@ from cap4d.player.camera_path import STANDING, camera_path, fitted, with_live_he
 
 Clock = Callable[[], float]
 
-WINDOW_ACTIONS = (Action.SCREENSHOT, Action.RECORD, Action.QUIT, Action.FULLSCREEN)
+WINDOW_ACTIONS = (Action.SCREENSHOT, Action.RECORD, Action.QUIT, Action.FULLSCREEN, Action.VSYNC)
 """What only the window can do; it takes them from `Viewer.asked`."""
 
 
@@ -83,6 +84,7 @@ class Viewer:
         self.overlays: frozenset[Overlay] = frozenset()
         self.overlay_part = Part.ALL
         self.display_hz = 60.0
+        self.has_vsync = True  # pictures wait for the display
         self.recording_since: float | None = None
         self.asked: deque[Action] = deque()
         self.has_news = False  # a message that was not drawn yet
@@ -152,7 +154,9 @@ class Viewer:
             ACTIONS[action](self)
 
     def open(self, path: Path) -> None:
-        """Opens a file for what its name says it is."""
+        """Opens a file for what its name says it is; a recent one that is gone is forgotten."""
+        if path in self.recent.files and not os.path.exists(path):
+            self.recent.forget(path)
         try:
             use = use_of(path)
         except Cap4dError as error:

@@ -25,6 +25,7 @@ from cap4d.app.shortcuts import Action
 from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
 from cap4d.app.window import DisplayUnavailableError, Window
+from imgui_bundle import imgui
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import write_bundle
@@ -70,6 +71,9 @@ class Pane:
 
     def show_cursor(self, shape):
         self.cursor = shape
+
+    def set_vsync(self, on):
+        self.vsync = on
 
     def set_title(self, title):
         self.title = title
@@ -278,9 +282,9 @@ def test_a_drag_that_began_on_the_face_goes_on_over_the_panels(play):
     listener.pointer(610, 200)
     assert controls.orbit != before
     listener.button(glfw.MOUSE_BUTTON_LEFT, False, 0)  # not the one that drags
-    assert controls.is_dragging
+    assert controls._drag is Drag.PAN
     listener.button(glfw.MOUSE_BUTTON_RIGHT, False, 0)
-    assert not controls.is_dragging
+    assert controls._drag is None
 
 
 def test_the_wheel_zooms_over_the_face_and_scrolls_over_a_panel(play):
@@ -379,6 +383,28 @@ def test_every_tab_menu_and_dialog_draws(play, monkeypatch):
         assert player.step()
     assert failures == []
     assert "F1" in WELCOME
+
+
+def test_vsync_is_a_switch_of_the_view_menu(play, monkeypatch):
+    player, pane = play(size=PANELS)
+    settle(player)
+    assert player.viewer.has_vsync
+    items, drawn = {}, imgui.menu_item_simple
+
+    def pressed(text, key="", on=False):
+        items[text] = on
+        drawn(text, key, on)
+        return text == "Vsync"
+
+    click(player, 68, 14)
+    monkeypatch.setattr(imgui, "menu_item_simple", pressed)
+    player.gui.touch()
+    player.step()
+    assert items["Vsync"]
+    player.step()
+    assert not pane.vsync
+    player.step()
+    assert pane.vsync
 
 
 def test_a_failing_source_costs_its_pictures_and_is_said(play):

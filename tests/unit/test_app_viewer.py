@@ -192,6 +192,19 @@ def test_a_file_that_is_nothing_is_a_message_and_nothing_changes(show, files, na
     assert viewer.recent.files == []
 
 
+def test_a_recent_file_that_is_gone_is_said_and_forgotten(show, files, tmp_path):
+    viewer = show()
+    gone, there = tmp_path / "gone.npz", files / "plain.cap4d"
+    viewer.recent.add(gone)
+    viewer.recent.add(there)
+    viewer.open(gone)
+    viewer.poll()
+    assert "gone.npz" in messages(viewer, Tone.ERROR)[0]
+    assert viewer.recent.files == [there]
+    viewer.open(there)
+    assert viewer.recent.files == [there]
+
+
 def test_a_dropped_image_stands_behind(show, files):
     viewer = show()
     viewer.open(files / "behind.png")
