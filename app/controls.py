@@ -33,10 +33,6 @@ class Controls:
         self._drag: Drag | None = None
         self._pointer = (0.0, 0.0)
 
-    @property
-    def is_dragging(self) -> bool:
-        return self._drag is not None
-
     def press(self, drag: Drag) -> None:
         """A button went down."""
         self._drag = drag

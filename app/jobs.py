@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Job:
     label: str
-    future: Future[Any]
+    work: Callable[[], Any]
     done: Callable[[Any], None]
+    must_be_done: bool
+    future: Future[Any] | None = None  # None: it did not begin
 
 
 class Jobs:
@@ -34,23 +36,37 @@ class Jobs:
         """What is being done, for the user; None: nothing."""
         return self._waiting[0].label if self._waiting else None
 
-    def start(self, label: str, work: Callable[[], Any], done: Callable[[Any], None]) -> None:
-        """Does `work` as soon as what was started before is through, then calls `done` in `poll`."""
-        self._waiting.append(_Job(label, self._executor.submit(work), done))
+    def start(
+        self, label: str, work: Callable[[], Any], done: Callable[[Any], None], *, must_be_done: bool = False
+    ) -> None:
+        """Does `work` as soon as the result of what was started before is taken over, as `work` may build on
+        it; then calls `done` in `poll`. What `must_be_done` is done at the latest by `close`."""
+        self._waiting.append(_Job(label, work, done, must_be_done))
+        self._begin()
 
     def poll(self) -> bool:
         """Takes over what has finished; whether anything has."""
         finished = 0
         while self._waiting and self._waiting[0].future.done():
-            job = self._waiting.popleft()
+            job = self._waiting[0]
             finished += 1
             try:
                 job.done(job.future.result())
             except Exception as error:  # whatever a file or a source did: the window goes on
                 self._on_error(error)
+            self._waiting.popleft()
+            self._begin()
         return finished > 0
 
     def close(self) -> None:
-        """Starts nothing more, and waits for what runs."""
+        """Waits for what runs, and starts nothing more but what must be done."""
         self._executor.shutdown(wait=True, cancel_futures=True)
+        left = [job for job in self._waiting if job.future is None or job.future.cancelled()]
         self._waiting.clear()
+        for job in left:
+            if job.must_be_done:
+                job.work()
+
+    def _begin(self) -> None:
+        if self._waiting and self._waiting[0].future is None:
+            self._waiting[0].future = self._executor.submit(self._waiting[0].work)

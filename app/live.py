@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Hashable
+from contextlib import ExitStack
 from pathlib import Path
 
 import moderngl
@@ -47,12 +48,12 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     player = LivePlayer(window, viewer, options.backend)
     try:
         player.run(options.frames)
+        _write_stats(player, options)
     except KeyboardInterrupt:  # a live source is often ended so: what was measured counts
         _write_stats(player, options)
         raise
     finally:
         player.close()
-    _write_stats(player, options)
 
 
 def _write_stats(player: LivePlayer, options: Options) -> None:
@@ -130,9 +131,10 @@ class LivePlayer:
 
     def close(self) -> None:
         """Ends what runs in the background, and Dear ImGui."""
-        self.taking.close()
-        self.viewer.close()
-        self.gui.release()
+        with ExitStack() as stack:  # all of it, even where a recording cannot be finished
+            stack.callback(self.gui.release)
+            stack.callback(self.viewer.close)
+            self.taking.close()
 
     def step(self) -> bool:
         """Shows what has changed; False if all of it is on screen already, or the window has no pixels."""
@@ -311,6 +313,10 @@ class LivePlayer:
         self.taking.toggle_recording((width, height))
         self.gui.touch()
 
+    def _toggle_vsync(self) -> None:
+        self.viewer.has_vsync = not self.viewer.has_vsync
+        self.window.set_vsync(self.viewer.has_vsync)
+
     def _obey(self) -> None:
         """Does what the user asked of the window itself."""
         while self.viewer.asked:
@@ -323,3 +329,5 @@ class LivePlayer:
                     self._toggle_recording()
                 case Action.FULLSCREEN:
                     self.window.toggle_fullscreen()
+                case Action.VSYNC:
+                    self._toggle_vsync()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ DEFORMER_HELP = (
     "exact, in a window the most exact that takes at most 8 ms a frame on this machine (default: auto)"
 )
 SERVE = "127.0.0.1:8300"
+
+Add = Callable[..., argparse.Action]  # `ArgumentParser.add_argument`
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,14 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add = parser.add_argument
+    _add_source(parser.add_argument)
+    _add_pictures(parser.add_argument)
+    _add_page(parser.add_argument)
+    return parser
+
+
+def _add_source(add: Add) -> None:
+    """Who plays, and what drives them."""
     add("avatar", nargs="?", type=Path, metavar="AVATAR.cap4d", help="default: the built-in demo avatar")
     add("--drive", metavar="SRC", help=DRIVE_HELP)
     add(
@@ -115,6 +124,10 @@ def build_parser() -> argparse.ArgumentParser:
     add("--no-gaze", dest="gaze", action="store_false", help="no glances where a live source has none")
     add("--no-neck", dest="neck", action="store_false", help="no breathing neck where a live source has none")
     add("--fps", type=_rate, help=FPS_HELP)
+
+
+def _add_pictures(add: Add) -> None:
+    """How it is drawn, and where to."""
     add("--backend", choices=("auto", "gl", "cpu"), default="auto", help="auto: gl where there is a GPU")
     add("--deformer", choices=DEFORMERS, default="auto", help=DEFORMER_HELP)
     add("--size", type=_size, metavar="WxH", help="picture (default: 512x512), or window")
@@ -131,6 +144,10 @@ def build_parser() -> argparse.ArgumentParser:
     add("--camera", default="static", metavar="static|orbit|FILE", help="camera path (default: static)")
     add("--audio", type=Path, metavar="FILE.wav", help="sound that plays with the source, or of out.mp4")
     add("--stats", type=Path, metavar="FILE", help="write times per stage to this JSON file")
+
+
+def _add_page(add: Add) -> None:
+    """In a browser."""
     add(
         "--serve",
         nargs="?",
@@ -139,7 +156,6 @@ def build_parser() -> argparse.ArgumentParser:
         help=f"no window: a page for browsers, with pictures of at most --size (default: {SERVE})",
     )
     add("--token", metavar="X", help="what --serve asks for (default: made up where others can reach it)")
-    return parser
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -39,19 +39,10 @@ class PlayClock:
         self.paused = not self.paused
         self._start_at(max(self._shown, 0), now)
 
-    def step(self, frames: int) -> None:
-        """Pauses and moves by `frames`, not before the first."""
-        self.paused = True
-        self._shown = max(self._shown + frames, 0)
-
     def seek(self, index: int, now: float) -> None:
         """To frame `index`, which is shown; plays on, or stays paused."""
         self._shown = max(index, 0)
         self._start_at(self._shown, now)
-
-    def rewind(self, now: float) -> None:
-        """Back to the first frame, which is shown."""
-        self.seek(0, now)
 
     def change_speed(self, speed: float, now: float) -> None:
         """Goes on from the frame shown at `speed` seconds of the clip per second."""

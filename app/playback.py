@@ -170,6 +170,12 @@ class ClipPlayback:
             self.clock.fps = self._smooth_hz / speed
         self._move(position, now)
 
+    def set_loops(self, on: bool, now: float) -> None:
+        """Whether it begins again at its end; the round that plays now goes on from where it is."""
+        position = self.position
+        self.loops = on
+        self._move(position, now)
+
     def set_smooth(self, display_hz: float | None, now: float) -> None:
         """Interpolates to `display_hz` pictures a second; None shows the clip's own frames."""
         position = self.position

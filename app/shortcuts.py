@@ -32,6 +32,7 @@ class Action(Enum):
     PANELS = auto()
     SIDEBAR = auto()
     FULLSCREEN = auto()
+    VSYNC = auto()
     HELP = auto()
 
 

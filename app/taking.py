@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,8 @@ class Taking:
         recorder, viewer = self.recorder, self.viewer
         self.recorder = viewer.recording_since = None
         if recorder is not None:
-            viewer.jobs.start("Finishing the recording", recorder.close, lambda _: _tell(viewer, recorder))
+            finished = partial(_tell, viewer, recorder)
+            viewer.jobs.start("Finishing the recording", recorder.close, finished, must_be_done=True)
 
     def close(self) -> None:
         """Finishes a recording that still runs, before the program ends."""
@@ -86,7 +88,7 @@ class Taking:
             self.recorder = None
 
 
-def _tell(viewer: Viewer, recorder: Recorder) -> None:
+def _tell(viewer: Viewer, recorder: Recorder, _: object) -> None:
     viewer.say(f"Saved {recorder.path}" if recorder.frames else "Nothing was recorded")
 
 

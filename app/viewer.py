@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
@@ -36,7 +37,7 @@ from cap4d.player.camera_path import STANDING, camera_path, fitted, with_live_he
 
 Clock = Callable[[], float]
 
-WINDOW_ACTIONS = (Action.SCREENSHOT, Action.RECORD, Action.QUIT, Action.FULLSCREEN)
+WINDOW_ACTIONS = (Action.SCREENSHOT, Action.RECORD, Action.QUIT, Action.FULLSCREEN, Action.VSYNC)
 """What only the window can do; it takes them from `Viewer.asked`."""
 
 
@@ -83,6 +84,7 @@ class Viewer:
         self.overlays: frozenset[Overlay] = frozenset()
         self.overlay_part = Part.ALL
         self.display_hz = 60.0
+        self.has_vsync = True  # pictures wait for the display
         self.recording_since: float | None = None
         self.asked: deque[Action] = deque()
         self.has_news = False  # a message that was not drawn yet
@@ -152,7 +154,9 @@ class Viewer:
             ACTIONS[action](self)
 
     def open(self, path: Path) -> None:
-        """Opens a file for what its name says it is."""
+        """Opens a file for what its name says it is; a recent one that is gone is forgotten."""
+        if path in self.recent.files and not os.path.exists(path):
+            self.recent.forget(path)
         try:
             use = use_of(path)
         except Cap4dError as error:
@@ -184,13 +188,12 @@ class Viewer:
 
     def drive(self, spec: str | None) -> None:
         """Lets another source drive the avatar: a file, an address, or None for its own idle clip."""
-        bundle, before = self.loaded.bundle, self.playback
         name = "the idle clip" if spec is None else spec
 
         def open_it() -> Playback:
-            if before.is_live:
-                before.close()  # the next one may listen to the same address
-            return open_playback(spec, bundle, fill=self.fill)
+            if self.playback.is_live:
+                self.playback.close()  # the next one may listen to the same address
+            return open_playback(spec, self.loaded.bundle, fill=self.fill)
 
         self.jobs.start(f"Opening {name}", open_it, lambda playback: self._play(playback, spec))
 
@@ -245,7 +248,11 @@ class Viewer:
         self.controls.reset()
 
     def _play(self, playback: Playback, spec: str | None) -> None:
-        self.avatar.check_rig(playback.rig_name)
+        try:
+            self.avatar.check_rig(playback.rig_name)
+        except Cap4dError:
+            playback.close()  # a live one holds a thread and a port
+            raise
         self._replace_playback(playback)
         if spec is not None and not playback.is_live:
             self.recent.add(Path(spec))
@@ -325,7 +332,7 @@ CLIP_ACTIONS: dict[Action, Callable[[Viewer, ClipPlayback], None]] = {
     Action.NEXT: lambda viewer, playback: playback.step(1, viewer.now),
     Action.PREVIOUS: lambda viewer, playback: playback.step(-1, viewer.now),
     Action.REWIND: lambda viewer, playback: playback.rewind(viewer.now),
-    Action.LOOP: lambda _, playback: setattr(playback, "loops", not playback.loops),
+    Action.LOOP: lambda viewer, playback: playback.set_loops(not playback.loops, viewer.now),
     Action.FASTER: _change_speed(1),
     Action.SLOWER: _change_speed(-1),
     Action.SMOOTH: lambda viewer, playback: playback.set_smooth(

@@ -71,6 +71,7 @@ def _draw_view(viewer: Viewer) -> None:
     _item(viewer, Action.SIDEBAR, "Sidebar", on=viewer.shows_sidebar)
     _item(viewer, Action.PANELS, "Panels", on=viewer.shows_panels)
     _item(viewer, Action.FULLSCREEN, "Full screen")
+    _item(viewer, Action.VSYNC, "Vsync", on=viewer.has_vsync)
     imgui.separator()
     _item(viewer, Action.RESET_VIEW, "Reset the camera")
     _item(viewer, Action.RESET_FACE, "Let go of every slider")

@@ -58,9 +58,9 @@ def statistics_rows(statistics: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = []
     for name, value in statistics.items():
         if isinstance(value, Mapping):
-            rows += [(f"{name}: {inner}".replace("_", " "), _shown(v)) for inner, v in value.items() if v]
+            rows += [(_label(name, inner), _shown(v)) for inner, v in value.items() if v]
         else:
-            rows.append((name.replace("_", " "), _shown(value)))
+            rows.append((_label(name), _shown(value)))
     return rows
 
 
@@ -68,6 +68,13 @@ def graph_top(rows: np.ndarray) -> float:
     """ms: a step that nearly all pictures stay under: one slow picture does not flatten the rest."""
     most = float(np.percentile(rows.sum(1), 95)) if len(rows) else 0.0
     return next((step for step in STEPS_MS if most <= step), STEPS_MS[-1])
+
+
+def _label(name: str, inner: str = "") -> str:
+    """`latency_ms`, `median` -> `latency, median ms`"""
+    unit = "ms" if name.endswith("_ms") else ""
+    detail = " ".join(filter(None, (inner, unit)))
+    return ", ".join(filter(None, (name.removesuffix("_ms"), detail))).replace("_", " ")
 
 
 def _shown(value: object) -> str:

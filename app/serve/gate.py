@@ -8,13 +8,13 @@ goes before everything.
 
 from __future__ import annotations
 
-import ipaddress
 import secrets
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.parse import parse_qs, urlencode, urlsplit
 
+from cap4d.drive.open_live import is_loopback
 from cap4d.drive.wire import same_token
 from cap4d.errors import ArgumentError
 
@@ -55,23 +55,19 @@ def parse_address(text: str) -> tuple[str, int]:
     return host, port
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches it; a name other than localhost counts as not."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 class Gate:
     """Answers for one address.
 
     Args:
         host: What is listened on.
         token: What a request must bear; None: nothing on loopback, one made up elsewhere.
+    Raises:
+        ArgumentError: The token is empty.
     """
 
     def __init__(self, host: str, token: str | None = None) -> None:
+        if token == "":  # as from a shell variable that is not set: it would let everybody in
+            raise ArgumentError("token: expected a word, got none")
         self.host, self.loopback = host, is_loopback(host)
         self.token = token if token is not None or self.loopback else secrets.token_urlsafe(16)
 

@@ -65,12 +65,13 @@ class Pace:
         return any(now - sent > STALLED for _, sent in self._in_flight.values())
 
     def acknowledged(self, number: int, now: float) -> float | None:
-        """Picture `number` is on screen, and with it all before it; its latency, or None if it was known."""
-        begun, _ = self._in_flight.get(number, (None, None))
+        """Picture `number` is on screen, and with it all before it; its latency. None: it is not under way,
+        and this says nothing."""
+        if number not in self._in_flight:
+            return None
+        begun, _ = self._in_flight[number]
         for other in [n for n in self._in_flight if n <= number]:
             del self._in_flight[other]
-        if begun is None:
-            return None
         latency = now - begun
         self.latencies.append(latency)
         self._floor = min(self._floor, latency)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from cap4d.app.overrides import Overrides
 from cap4d.app.playback import ClipPlayback, StreamPlayback
 
 from cap4d.bundle.bundle import Bundle
@@ -30,8 +30,7 @@ class Performance:
         self.playback, self.is_live = playback, playback.is_live
         self.names, self.ranges = expression_names(bundle), expression_ranges(bundle)
         self.groups = expression_groups(bundle)
-        self.held: dict[str, float] = {}  # expression -> its value
-        self.edits = 0
+        self.overrides = Overrides(self.ranges)
         self._index = {name: i for i, name in enumerate(self.names)}
         self._interval = 1 / (LIVE_FPS if self.is_live else MAX_FPS)
         self._frozen = False  # a live stream, by somebody's wish
@@ -61,13 +60,19 @@ class Performance:
         """Why nothing comes any more, if so."""
         return self.playback.error if self.is_live else None
 
+    @property
+    def held(self) -> dict[str, float]:
+        """expression -> the value that it is held at"""
+        values = self.overrides.values
+        return {self.names[i]: float(values[i]) for i in np.flatnonzero(self.overrides.held)}
+
     def number(self, now: float) -> tuple[int, int]:
         """Changes when there is something new to show."""
         if now >= self._look and not self._frozen:
             before, self._number = self._number, self.playback.number(now)
             if self.is_live or before != self._number:
                 self._look = max(self._look + self._interval, now)
-        return self._number, self.edits
+        return self._number, self.overrides.version
 
     def due(self) -> float:
         """When something new may be there by itself."""
@@ -75,13 +80,7 @@ class Performance:
 
     def frame(self) -> Frame:
         """The frame that `number` last spoke of, with what is held."""
-        frame = self.playback.frame()
-        if not self.held:
-            return frame
-        expr = np.array(frame.expr, np.float32)
-        for name, value in self.held.items():
-            expr[self._index[name]] = value
-        return replace(frame, expr=expr)
+        return self.overrides.apply(self.playback.frame())
 
     def drawn(self, now: float) -> None:
         """The picture of the last `frame` is ready."""
@@ -106,16 +105,10 @@ class Performance:
         """Holds an expression within its range; None lets it go. Names of other rigs are passed over."""
         if name not in self._index:
             return
-        self.edits += 1
         if value is None:
-            self.held.pop(name, None)
+            self.overrides.let_go(self._index[name])
         else:
-            self.held[name] = float(np.clip(value, *self.ranges[self._index[name]]))
-
-    def release(self) -> None:
-        """Lets all expressions go."""
-        self.held.clear()
-        self.edits += 1
+            self.overrides.hold(self._index[name], value)
 
     def statistics(self) -> Mapping[str, Any]:
         """Of a live stream."""

@@ -22,6 +22,7 @@ CLOSING_SECONDS = 1.0  # for goodbyes
 SENDING_SECONDS = 10.0  # that a message may take to leave
 PING_SECONDS = 10.0  # between pings, and for their answers
 MAX_CONNECTIONS = 64  # on the port, half-open ones counted
+MAX_WAITING = 64  # messages that have not left for one browser; two of them are pictures, the rest is small
 MESSAGES_PER_SECOND = 400  # of one page; it sends a few per picture
 FULL = "{} people are watching already. Try again when one has left."
 POLICY, TRY_AGAIN = 1008, 1013  # WebSocket close codes
@@ -139,12 +140,18 @@ class PageServer:
         """One browser, from its coming to its going."""
         from websockets.exceptions import ConnectionClosed
 
-        messages: asyncio.Queue[bytes | str] = asyncio.Queue()
+        messages: asyncio.Queue[bytes | str] = asyncio.Queue(MAX_WAITING)
         loop = asyncio.get_running_loop()
+
+        def put(data: bytes | str) -> None:
+            try:
+                messages.put_nowait(data)
+            except asyncio.QueueFull:  # it does not take what it is sent
+                socket.transport.abort()
 
         def deliver(data: bytes) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has just ended
-                loop.call_soon_threadsafe(messages.put_nowait, data)
+                loop.call_soon_threadsafe(put, data)
 
         watcher = self.studio.admit(deliver)
         if watcher is None:
@@ -152,8 +159,8 @@ class PageServer:
             await socket.close(TRY_AGAIN, "full")
             return
         self._sockets[watcher] = socket
-        messages.put_nowait(json.dumps({"hello": self.studio.introduction() | {"title": self.title}}))
-        messages.put_nowait(json.dumps({"state": self.studio.state()}))
+        put(json.dumps({"hello": self.studio.introduction() | {"title": self.title}}))
+        put(json.dumps({"state": self.studio.state()}))
         sender = asyncio.create_task(self._send(socket, messages))
         try:
             await self._hear(socket, watcher, messages)

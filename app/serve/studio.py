@@ -123,17 +123,17 @@ class Studio:
             if message.ack is not None:
                 self._acknowledge(watcher, message.ack, now)
             watcher.look(message, self._view)
-            before = performance.paused, performance.edits
+            before = performance.paused, performance.overrides.version
             if message.play is not None:
                 performance.pause(not message.play, now)
             if message.seek is not None:
                 performance.seek(message.seek, now)
             if message.reset:
-                performance.release()
+                performance.overrides.reset()
             for name, value in message.expr.items():
                 performance.hold(name, value)
             self._changed.notify()
-            return before != (performance.paused, performance.edits)
+            return before != (performance.paused, performance.overrides.version)
 
     def stalled(self) -> list[Watcher]:
         """Those who have not shown what they were sent for too long."""
@@ -162,7 +162,7 @@ class Studio:
     def state(self) -> dict[str, Any]:
         """What everybody shares."""
         with self._changed:
-            return {"paused": self.performance.paused, "held": dict(self.performance.held)}
+            return {"paused": self.performance.paused, "held": self.performance.held}
 
     def statistics(self) -> dict[str, Any]:
         """Of `--stats`: latencies from the begin of drawing to the echo that it is shown."""

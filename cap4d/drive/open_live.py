@@ -96,7 +96,7 @@ def parse_address(spec: str) -> Address:
         raise ArgumentError(
             f"drive: expected {scheme}://HOST:PORT or {scheme}://HOST:PORT?{key}=..., got {spec}"
         )
-    if not query.get(key) and (key in query or not _is_loopback(host)):
+    if not query.get(key) and (key in query or not is_loopback(host)):
         raise ArgumentError(f"drive: expected ?{key}=..., as {host} can be reached by others, got {spec}")
     return Address(host, port, query.get("token"), query.get("from"))
 
@@ -136,7 +136,8 @@ def _datagram_receiver(scheme: str, address: Address) -> Receiver:
     return DatagramReceiver(address.host, address.port, sender=address.sender)
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches it; a name other than localhost counts as not."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

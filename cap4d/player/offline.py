@@ -162,26 +162,17 @@ def render_to(
     """
     fps = output.fps or clip.fps
     total = frame_count(clip, output.frames, fps)
-    if output.stats is not None:
-        check_file(output.stats, "stats")
     path = camera_path(camera, avatar.camera, head_centre(avatar), fps=fps, size=output.size)
-    if output.path is not None:
-        view = path(0, clip.frame(0))
-        size, sounds = (view.width, view.height), output.audio is not None
-        check_output(Path(output.path), fps=fps, frames=total, size=size, sound=sounds)
+    _check(output, path(0, clip.frame(0)), fps=fps, total=total)
     sound = None if output.audio is None else Sound.load(output.audio)
     images = render_clip(avatar, clip, path, frames=total, fps=fps, draw=draw, pipelined=pipelined)
     first = next(images)
     avatar.stages.clear()  # the first frame loads what the others find loaded
-    start = shown = time.perf_counter()
+    start = time.perf_counter()
     with VideoWriter(output.path, fps=fps, sound=sound) if output.path is not None else _Nowhere() as writer:
-        for done, image in enumerate(_chain(first, images), 1):
+        for image in _with_progress(_chain(first, images), total):
             with avatar.stages.time("write"):
                 writer.write(image)
-            if time.perf_counter() - shown > PROGRESS_SECONDS:
-                shown = time.perf_counter()
-                left = (shown - start) / done * (total - done)
-                log.info("frame %d of %d, %.0f s left", done, total, left)
     seconds = time.perf_counter() - start
     stats = statistics(avatar, total, seconds, size=(first.shape[1], first.shape[0]), backend=backend)
     if output.stats is not None:
@@ -292,6 +283,26 @@ class _Nowhere:
 
     def write(self, image: np.ndarray) -> None:
         pass
+
+
+def _check(output: Output, view: Camera, *, fps: float, total: int) -> None:
+    """Raises ArgumentError where `total` pictures, the first seen by `view`, cannot be written so."""
+    if output.stats is not None:
+        check_file(output.stats, "stats")
+    if output.path is not None:
+        size, sounds = (view.width, view.height), output.audio is not None
+        check_output(Path(output.path), fps=fps, frames=total, size=size, sound=sounds)
+
+
+def _with_progress(images: Iterator[np.ndarray], total: int) -> Iterator[np.ndarray]:
+    """The same pictures; says now and then how long the rest of `total` will take."""
+    start = shown = time.perf_counter()
+    for done, image in enumerate(images, 1):
+        yield image
+        if time.perf_counter() - shown > PROGRESS_SECONDS:
+            shown = time.perf_counter()
+            left = (shown - start) / done * (total - done)
+            log.info("frame %d of %d, %.0f s left", done, total, left)
 
 
 def _chain(first: np.ndarray, rest: Iterator[np.ndarray]) -> Iterator[np.ndarray]:

@@ -13,20 +13,24 @@ import numpy as np
 import pytest
 from cap4d.app.controls import Drag
 from cap4d.app.gl_context import GlUnavailableError, headless_context
+from cap4d.app.gui import Gui
 from cap4d.app.layout import Rect
 from cap4d.app.live import LivePlayer, choose_renderer, play_live
 from cap4d.app.loading import Loaded
-from cap4d.app.panels.notes import WELCOME
 from cap4d.app.options import parse_options
+from cap4d.app.panels.notes import WELCOME
 from cap4d.app.playback import ClipPlayback
 from cap4d.app.recent import RecentFiles
 from cap4d.app.renderers import CpuRenderer, GlRenderer
 from cap4d.app.shortcuts import Action
+from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
 from cap4d.app.window import DisplayUnavailableError, Window
+from imgui_bundle import imgui
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import write_bundle
+from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import head_centre
 
@@ -68,6 +72,9 @@ class Pane:
 
     def show_cursor(self, shape):
         self.cursor = shape
+
+    def set_vsync(self, on):
+        self.vsync = on
 
     def set_title(self, title):
         self.title = title
@@ -276,9 +283,9 @@ def test_a_drag_that_began_on_the_face_goes_on_over_the_panels(play):
     listener.pointer(610, 200)
     assert controls.orbit != before
     listener.button(glfw.MOUSE_BUTTON_LEFT, False, 0)  # not the one that drags
-    assert controls.is_dragging
+    assert controls._drag is Drag.PAN
     listener.button(glfw.MOUSE_BUTTON_RIGHT, False, 0)
-    assert not controls.is_dragging
+    assert controls._drag is None
 
 
 def test_the_wheel_zooms_over_the_face_and_scrolls_over_a_panel(play):
@@ -379,6 +386,28 @@ def test_every_tab_menu_and_dialog_draws(play, monkeypatch):
     assert "F1" in WELCOME
 
 
+def test_vsync_is_a_switch_of_the_view_menu(play, monkeypatch):
+    player, pane = play(size=PANELS)
+    settle(player)
+    assert player.viewer.has_vsync
+    items, drawn = {}, imgui.menu_item_simple
+
+    def pressed(text, key="", on=False):
+        items[text] = on
+        drawn(text, key, on)
+        return text == "Vsync"
+
+    click(player, 68, 14)
+    monkeypatch.setattr(imgui, "menu_item_simple", pressed)
+    player.gui.touch()
+    player.step()
+    assert items["Vsync"]
+    player.step()
+    assert not pane.vsync
+    player.step()
+    assert pane.vsync
+
+
 def test_a_failing_source_costs_its_pictures_and_is_said(play):
     player, _ = play()
     player.run(1)
@@ -391,6 +420,24 @@ def test_a_failing_source_costs_its_pictures_and_is_said(play):
     assert toast.count == 3
     assert player.gui.is_moving  # so that the message is drawn though the face is not
     assert "finite" in toast.text
+
+
+def test_a_recording_that_fails_at_the_end_keeps_nothing_else_from_ending(ctx, tmp_path, monkeypatch):
+    def fails(_):
+        raise ArgumentError("no space left")
+
+    ended = []
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setattr(Taking, "close", fails)
+    for kind, name in ((Viewer, "close"), (Gui, "release")):
+        end = getattr(kind, name)
+        monkeypatch.setattr(kind, name, lambda self, end=end: (ended.append(type(self)), end(self)))
+    write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
+    options = parse_options([str(tmp_path / "tiny.cap4d"), "--backend=cpu", f"--stats={tmp_path / 's.json'}"])
+    with pytest.raises(ArgumentError, match="no space left"):
+        play_live(options.avatar, replace(options, frames=1), Pane(ctx, (120, 90)))
+    assert ended == [Viewer, Gui]
+    assert (tmp_path / "s.json").is_file()
 
 
 def test_a_failing_panel_costs_its_panels_only(play, monkeypatch, caplog):

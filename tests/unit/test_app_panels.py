@@ -25,12 +25,20 @@ def test_a_tiers_error_is_never_nothing():
 
 
 def test_the_counts_of_a_live_source_are_unfolded_and_causes_without_one_left_out():
-    counts = {"received": 12345, "depth_ms": 41.25, "connected": True, "rejected": {"late": 2, "rig": 0}}
+    counts = {
+        "received": 12345,
+        "depth_ms": 41.25,
+        "connected": True,
+        "rejected": {"not_finite": 2, "rig": 0},
+    }
+    counts |= {"clock_jumps": 1, "latency_ms": {"median": 31.5, "p95": 0.0}}
     assert statistics_rows(counts) == [
         ("received", "12,345"),
-        ("depth ms", "41.2"),
+        ("depth, ms", "41.2"),
         ("connected", "yes"),
-        ("rejected: late", "2"),
+        ("rejected, not finite", "2"),
+        ("clock jumps", "1"),
+        ("latency, median ms", "31.5"),
     ]
 
 

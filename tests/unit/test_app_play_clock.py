@@ -29,23 +29,6 @@ def test_a_pause_holds_the_frame_and_goes_on_from_it():
     assert clock.dropped == dropped
 
 
-def test_steps_pause_and_stop_at_the_first_frame():
-    clock = PlayClock(10, 0.0)
-    clock.index(0.2)
-    clock.step(1)
-    assert clock.paused
-    assert clock.index(9.0) == 3
-    clock.step(-100)
-    assert clock.index(9.0) == 0
-
-
-def test_rewinding_starts_over():
-    clock = PlayClock(10, 0.0)
-    clock.index(1.0)
-    clock.rewind(1.0)
-    assert [clock.index(t) for t in (1.0, 1.1)] == [0, 1]
-
-
 def test_speed_changes_how_fast_frames_come_and_not_which_is_shown():
     clock = PlayClock(10, 0.0)
     clock.index(1.0)

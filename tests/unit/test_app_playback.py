@@ -30,13 +30,24 @@ def test_it_plays_the_clip_again_and_again(playback):
 
 
 def test_without_repeat_it_stops_on_the_last_frame_and_plays_again_from_the_first(playback):
-    playback.loops = False
+    playback.set_loops(False, 0.0)
     np.testing.assert_array_equal(shown(playback, 5.0), CLIP.expr[-1])
     assert playback.is_paused
     assert playback.due() == float("inf")
     assert playback.position == pytest.approx(1.1)
     playback.toggle(6.0)
     np.testing.assert_array_equal(shown(playback, 6.1), CLIP.expr[1])
+
+
+def test_repeat_is_turned_off_in_a_later_round_and_that_round_plays_to_its_end(playback):
+    playback.number(2.7)
+    moves = playback.moves
+    playback.set_loops(False, 2.7)
+    np.testing.assert_array_equal(shown(playback, 2.8), CLIP.expr[4])
+    assert not playback.is_paused
+    assert playback.moves > moves  # a sound beside it goes there, too
+    np.testing.assert_array_equal(shown(playback, 9.0), CLIP.expr[-1])
+    assert playback.is_paused
 
 
 def test_a_pause_holds(playback):
@@ -53,7 +64,7 @@ def test_steps_go_round_the_ends_of_a_clip_that_repeats(playback):
     np.testing.assert_array_equal(shown(playback, 1.0), CLIP.expr[11])
     playback.step(2, 1.0)
     np.testing.assert_array_equal(shown(playback, 2.0), CLIP.expr[1])
-    playback.loops = False
+    playback.set_loops(False, 2.0)
     playback.step(-5, 2.0)
     np.testing.assert_array_equal(shown(playback, 3.0), CLIP.expr[0])
 

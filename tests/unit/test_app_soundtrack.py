@@ -72,7 +72,7 @@ def test_speed_is_followed_and_a_clip_that_stops_stops_the_sound(stage):
     now, playback, soundtrack = stage
     run(stage, 0.1)
     playback.set_speed(2.0, now.seconds)
-    playback.loops = False
+    playback.set_loops(False, now.seconds)
     run(stage, 0.5)
     assert soundtrack.player.speed == 2
     assert playback.position == pytest.approx(0.9, abs=0.21)  # heard a step of ours late

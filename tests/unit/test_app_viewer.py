@@ -192,6 +192,19 @@ def test_a_file_that_is_nothing_is_a_message_and_nothing_changes(show, files, na
     assert viewer.recent.files == []
 
 
+def test_a_recent_file_that_is_gone_is_said_and_forgotten(show, files, tmp_path):
+    viewer = show()
+    gone, there = tmp_path / "gone.npz", files / "plain.cap4d"
+    viewer.recent.add(gone)
+    viewer.recent.add(there)
+    viewer.open(gone)
+    viewer.poll()
+    assert "gone.npz" in messages(viewer, Tone.ERROR)[0]
+    assert viewer.recent.files == [there]
+    viewer.open(there)
+    assert viewer.recent.files == [there]
+
+
 def test_a_dropped_image_stands_behind(show, files):
     viewer = show()
     viewer.open(files / "behind.png")
@@ -251,6 +264,34 @@ def test_another_rigs_clip_is_refused(show, files, monkeypatch):
     viewer.poll()
     assert viewer.playback is playback
     assert "expected expressions of tiny" in messages(viewer)[0]
+
+
+def test_a_source_asked_for_while_an_avatar_loads_is_opened_for_that_avatar(show, files, monkeypatch):
+    viewer = show("plain.cap4d")
+    opened = []
+
+    def open_for(spec, bundle, **settings):
+        opened.append((spec, bundle))
+        return open_playback(None, bundle)
+
+    monkeypatch.setattr("cap4d.app.viewer.open_playback", open_for)
+    viewer.open(files / "tiny.cap4d")
+    viewer.drive("talk.npz")
+    viewer.poll()
+    assert viewer.loaded.path == files / "tiny.cap4d"
+    assert opened[-1] == ("talk.npz", viewer.loaded.bundle)
+
+
+def test_a_live_source_of_another_rig_is_closed(show, monkeypatch):
+    viewer = show()
+    zeros = np.zeros(3, np.float32)
+    stream = Stream(Frame(0.0, "other", np.zeros(5, np.float32), zeros, zeros, zeros))
+    foreign = StreamPlayback(stream, rig_name="other")
+    monkeypatch.setattr("cap4d.app.viewer.open_playback", lambda *_, **_settings: foreign)
+    viewer.drive("tcp://127.0.0.1:9000")
+    viewer.poll()
+    assert "expected expressions of tiny" in messages(viewer, Tone.ERROR)[0]
+    assert not stream.runs
 
 
 def test_a_live_head_turns_in_the_picture_but_does_not_leave_it(show):

@@ -271,6 +271,14 @@ def test_render_to_writes_what_it_drew_and_its_times(avatar: Avatar, tmp_path: P
     assert stats["dropped"] == stats["late"] == 0 and stats["memory_mb"] > 10 and stats["fps"] > 0
 
 
+def test_a_long_render_says_how_far_it_is(avatar: Avatar, monkeypatch, caplog) -> None:
+    monkeypatch.setattr("cap4d.player.offline.PROGRESS_SECONDS", -1.0)
+    caplog.set_level("INFO")
+    render_to(avatar, avatar.idle, "static", Output(None, frames=2))
+    said = [message.split(",")[0] for message in caplog.messages if message.startswith("frame")]
+    assert said == ["frame 1 of 2", "frame 2 of 2"]
+
+
 def test_another_backend_draws_the_same_frames(avatar: Avatar, tmp_path: Path) -> None:
     seen = []
 

@@ -58,6 +58,12 @@ def test_another_address_refuses_all_but_the_token(path, query):
     assert gate.refusal(f"{path}?token=secret", {"Host": "192.168.1.2:8300"}) is None
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_an_empty_token_opens_nothing(host):
+    with pytest.raises(ArgumentError, match="token: expected a word, got none"):
+        Gate(host, "")
+
+
 def test_a_token_is_made_up_where_none_is_named_and_stands_in_the_address():
     gates = Gate("192.168.1.2"), Gate("192.168.1.2")
     assert gates[0].token != gates[1].token

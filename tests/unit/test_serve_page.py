@@ -382,6 +382,21 @@ def test_who_does_not_show_what_is_sent_is_dropped(served, monkeypatch):
             client.picture(echo=False)
 
 
+def test_who_does_not_take_what_is_sent_is_dropped(monkeypatch):
+    async def send_nothing(*_):
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(PageServer, "_send", send_nothing)
+    with (
+        serving() as served,
+        connect(served.url(), compression=None, proxy=None) as line,
+        pytest.raises(ConnectionClosed),
+    ):
+        for i in range(server_module.MAX_WAITING):  # everybody is told of each, this one included
+            line.send(json.dumps({"play": bool(i % 2)}))
+        line.recv(timeout=PATIENCE)
+
+
 def test_connections_have_a_limit(monkeypatch):
     monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 3)
     with serving() as served:
