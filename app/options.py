@@ -27,8 +27,8 @@ keys: space pause, left/right step a frame, r reset the camera, h hide the panel
 
 
 DRIVE_HELP = (
-    "fit.npz, vertices .npy or Live Link Face .csv; or live: - (lines of JSON), tcp://, udp:// or ws://HOST:PORT, livelink://, "
-    "vmc://, webcam://0 (default: the avatar's idle clip)"
+    "fit.npz, vertices .npy or Live Link Face .csv; or live: - (lines of JSON), tcp://, udp:// or "
+    "ws://HOST:PORT, livelink://, vmc://, webcam://0 (default: the avatar's idle clip)"
 )
 PICTURE = 512, 512  # px, where no size is asked for
 DEFORMERS = ("auto", "full", "fp16", "int8", "linear", "off")
