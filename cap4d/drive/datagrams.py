@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from cap4d.drive.gate import SILENCE, Budget
+from cap4d.drive.gate import MAX_RATE, SILENCE, Budget
 from cap4d.drive.packet import Cause, Packet, Rejected, Sink
 from cap4d.drive.tcp import authority, listen
 from cap4d.errors import ArgumentError
@@ -41,6 +41,7 @@ class DatagramReceiver:
         port: 0 for any that is free; `address` names it.
         sender: The only address that may send, by number or by name; None: whoever reaches us.
         parser: Makes a sender's parser.
+        rate: Datagrams a second that the protocol may need; their bytes are limited all the same.
     Raises:
         ArgumentError: There is no listening there, or no such sender.
     """
@@ -53,6 +54,7 @@ class DatagramReceiver:
         *,
         sender: str | None,
         parser: Callable[[], Parser],
+        rate: float = MAX_RATE,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._allowed = None if sender is None else _addresses(sender)
@@ -61,7 +63,7 @@ class DatagramReceiver:
         self._socket.settimeout(POLL)
         self.address = f"{scheme}://{authority(self._socket)}"
         self._parser, self._ruler, self._heard = parser(), None, float("-inf")
-        self._budget = Budget()
+        self._budget = Budget(rate=rate)
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
