@@ -93,13 +93,13 @@ class DatagramReceiver:
     def _admit(self, sender: tuple, size: int, now: float) -> None:
         if self._allowed is not None and _number(sender[0]) not in self._allowed:
             raise Rejected(Cause.SENDER, "of an address that may not send")
+        is_another = self._ruler not in (None, sender[:2])
+        if is_another and now - self._heard <= SILENCE:  # not at the cost of who rules
+            raise Rejected(Cause.SENDER, "another one sends already")
         if not self._budget.take(size, now):
             raise Rejected(Cause.FLOOD, "more datagrams than any sender needs")
-        if self._ruler in (None, sender[:2]):
-            return
-        if now - self._heard <= SILENCE:
-            raise Rejected(Cause.SENDER, "another one sends already")
-        self._ruler, self._parser = None, self._new_parser()
+        if is_another:
+            self._ruler, self._parser = None, self._new_parser()
 
     def _receive(self) -> tuple[bytes, tuple | None]:
         """A datagram and who sent it; None where none came."""
