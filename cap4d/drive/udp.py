@@ -56,12 +56,20 @@ class UdpReceiver:
         with self._socket:
             while not stop.is_set():
                 data, sender = self._receive(sink)
-                for line in data.split(b"\n"):
-                    if line.strip():
-                        refused = refused + 1 if gate.line(sender, line, self._clock()) is None else 0
+                refused = self._listen_to(gate, sender, data, refused)
                 if refused > MAX_REFUSED:
                     refused = 0
                     stop.wait(BREATH)
+
+    def _listen_to(self, gate: Gate, sender: object, data: bytes, refused: int) -> int:
+        """Looks at a datagram's lines up to one too many; how many were refused in a row."""
+        lines = [line for line in data.split(b"\n") if line.strip()]
+        for done, line in enumerate(lines, 1):
+            refused = refused + 1 if gate.line(sender, line, self._clock()) is None else 0
+            if gate.flooded:
+                gate.sink.rejected(Cause.FLOOD, times=len(lines) - done)
+                break
+        return refused
 
     def _receive(self, sink: Sink) -> tuple[bytes, object]:
         """A datagram and who sent it; an empty one where none came."""

@@ -33,6 +33,7 @@ class Kept:
         self.packets: list[Packet] = []
         self.arrivals: list[float] = []
         self.causes: Counter[str] = Counter()
+        self.refusals = 0  # calls of `rejected`
 
     def packet(self, packet: Packet, arrival: float) -> bool:
         if packet.rig_name != "tiny":
@@ -44,6 +45,7 @@ class Kept:
 
     def rejected(self, cause, detail="", *, times=1) -> None:
         self.causes[str(cause)] += times
+        self.refusals += 1
 
     def until(self, condition: Callable[[], bool]) -> None:
         end = time.monotonic() + PATIENCE
@@ -262,6 +264,14 @@ def test_udp_asks_for_the_token_in_every_datagram() -> None:
             send(data)
         sink.until(lambda: sink.causes["token"] == 3)
         assert sink.stamps() == [3.0]
+
+
+def test_udp_a_datagram_of_many_lines_is_left_at_the_first_too_many() -> None:
+    receiver = UdpReceiver("127.0.0.1", 0)
+    with running(receiver) as sink, datagrams(receiver) as send:
+        send(b"x\n" * 30_000)
+        sink.until(lambda: sum(sink.causes.values()) == 30_000)
+        assert sink.causes["flood"] > 29_000 and sink.refusals < 1000
 
 
 def test_udp_a_flood_is_cut_even_where_the_system_drops_it() -> None:
