@@ -13,6 +13,7 @@ from collections.abc import Callable
 from cap4d.drive.gate import Gate
 from cap4d.drive.packet import Cause, Sink
 from cap4d.drive.tcp import authority, listen
+from cap4d.drive.wire import lines_of
 
 MAX_DATAGRAM = 1 << 16
 RECEIVE_BUFFER = 1 << 20  # bytes the system keeps for us
@@ -63,7 +64,7 @@ class UdpReceiver:
 
     def _listen_to(self, gate: Gate, sender: object, data: bytes, refused: int) -> int:
         """Looks at a datagram's lines up to one too many; how many were refused in a row."""
-        lines = [line for line in data.split(b"\n") if line.strip()]
+        lines = lines_of(data)
         for done, line in enumerate(lines, 1):
             refused = refused + 1 if gate.line(sender, line, self._clock()) is None else 0
             if gate.flooded:

@@ -22,7 +22,7 @@ from cap4d.drive.gate import Gate
 from cap4d.drive.pace import Pace, unread
 from cap4d.drive.packet import Cause, Sink
 from cap4d.drive.tcp import FLOODED, GREETING, IDLE, MAX_CONNECTIONS, authority, listen
-from cap4d.drive.wire import MAX_LINE, same_token
+from cap4d.drive.wire import MAX_LINE, lines_of, same_token
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -123,17 +123,20 @@ class _Visitors:
             self.gate.leave(connection)
 
     async def _listen_to(self, connection: ServerConnection) -> None:
-        pace, patience = Pace(), GREETING
+        pace, due = Pace(), self.clock() + GREETING
         while True:
             try:
-                message = await asyncio.wait_for(connection.recv(decode=False), patience)
+                message = await asyncio.wait_for(connection.recv(decode=False), due - self.clock())
             except TimeoutError:
                 self.sink.rejected(Cause.SENDER, "a connection is silent")
                 return await connection.close(POLICY, "silent")
-            patience = IDLE
+            lines = deque(lines_of(message))
+            if not lines:  # as good as silence, and no faster
+                await asyncio.sleep(POLL)
+                continue
+            due = self.clock() + IDLE
             if not self.gate.rules(connection, self.clock()):
                 await asyncio.sleep(POLL)  # for one who rules to have hung up just now
-            lines = deque(line for line in message.split(b"\n") if line.strip())
             while lines:
                 now = self.clock()
                 line = lines.popleft()

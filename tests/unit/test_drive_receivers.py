@@ -206,6 +206,13 @@ def test_tcp_a_flood_is_cut_and_the_work_bounded() -> None:
         assert used < 0.5  # s of a second, the sender's share among them
 
 
+def test_tcp_a_flood_of_blank_lines_is_one() -> None:
+    receiver = TcpReceiver("127.0.0.1", 0)
+    with running(receiver) as sink, connect(receiver) as sender:
+        sender.sendall(b"\n" * 60_000)
+        sink.until(lambda: sink.causes["flood"] > 50_000)
+
+
 def test_tcp_a_file_poured_in_plays_at_its_own_speed() -> None:
     receiver = TcpReceiver("127.0.0.1", 0)
     with running(receiver) as sink, connect(receiver) as sender:
@@ -451,4 +458,19 @@ def test_websocket_connections_that_say_nothing_are_hung_up_on(web, monkeypatch)
         with connect(receiver) as half_open:
             half_open.sendall(b"GET / HTT")
             closed(half_open)
+        assert sink.causes == {"sender": 1}
+
+
+def test_websocket_messages_without_a_line_are_silence(web, monkeypatch) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    make, dial = web
+    monkeypatch.setattr("cap4d.drive.websocket.GREETING", 0.3)
+    receiver = make("127.0.0.1", 0)
+    with running(receiver) as sink:
+        with dial(receiver.address) as sender, pytest.raises(ConnectionClosed, match="silent"):
+            end = time.monotonic() + PATIENCE
+            while time.monotonic() < end:
+                sender.send(b"\n" * 1000)
+                time.sleep(0.02)
         assert sink.causes == {"sender": 1}
