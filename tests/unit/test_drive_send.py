@@ -303,6 +303,12 @@ def test_live_link_face_packets_are_written_byte_by_byte():
     assert values == (*arkit.tolist(), *[0.0] * 9)
 
 
+@pytest.mark.parametrize(("t", "of_day"), [(1.8e9 + 0.5, 28800.5), (-1.0, 86399.0), (1e11, 35200.0)])
+def test_any_time_becomes_a_time_code_of_the_day(t, of_day):
+    back = parse_livelink(format_livelink(Packet(t, arkit=np.zeros(52, np.float32))))
+    assert back.t == pytest.approx(of_day, abs=1e-4)
+
+
 def test_what_is_written_is_read_back_gaze_and_head_too():
     rng = np.random.default_rng(0)
     eyes = turn(0.3, -0.2)
