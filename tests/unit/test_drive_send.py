@@ -277,6 +277,23 @@ def test_a_websocket_gets_a_message_a_frame_and_the_token_in_its_address(fit):
     )
 
 
+def test_garbage_to_a_websocket_that_hung_up_is_a_failure_to_send():
+    pytest.importorskip("websockets")
+    from websockets.sync.server import serve
+
+    with serve(lambda socket: None, "127.0.0.1", 0) as server:  # hangs up at once
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        target = open_target(f"ws://127.0.0.1:{server.socket.getsockname()[1]}")
+        assert target.connected(0.0)
+        end = time.monotonic() + 5
+        while sent := target.send(b"\xff\n", 0.0):
+            assert time.monotonic() < end
+        server.shutdown()
+        thread.join()
+    assert not sent and "1000" in target.reason
+
+
 def test_a_websocket_that_refuses_says_why():
     pytest.importorskip("websockets")
     from websockets.sync.server import serve
