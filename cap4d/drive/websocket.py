@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 POLL = 0.1  # s
+MAX_OPEN = 32  # connections on the port, half-open ones counted
 LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 TRY_AGAIN_LATER, POLICY = 1013, 1008  # close codes, RFC 6455 7.4.1 and IANA's registry
 
@@ -73,6 +74,7 @@ class WebSocketReceiver:
             visitors.drive,
             sock=self._listener,
             process_request=visitors.admit,
+            create_connection=_counted(visitors),
             compression=None,
             max_size=MAX_LINE,
             max_queue=16,
@@ -93,6 +95,7 @@ class _Visitors:
     def __init__(self, sink: Sink, token: str | None, clock: Callable[[], float]) -> None:
         self.sink, self.token, self.clock = sink, token, clock
         self.gate, self.count = Gate(sink), 0
+        self.open = 0  # connections, those included that have not said yet what they want
 
     def admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuses who lacks the token, comes from a foreign page, or is one too many."""
@@ -150,6 +153,25 @@ class _Visitors:
                 elif t is not None:
                     waiting = unread(connection.transport.get_extra_info("socket").fileno())
                     await asyncio.sleep(pace.lead(t, now, size=len(line), waiting=waiting))
+
+
+def _counted(visitors: _Visitors) -> type[ServerConnection]:
+    """Connections that are counted, and cut where there are too many."""
+    from websockets.asyncio.server import ServerConnection
+
+    class Counted(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            visitors.open += 1
+            super().connection_made(transport)
+            if visitors.open > MAX_OPEN:
+                visitors.sink.rejected(Cause.SENDER, f"{MAX_OPEN} connections are open already")
+                transport.abort()
+
+        def connection_lost(self, error: Exception | None) -> None:
+            visitors.open -= 1
+            super().connection_lost(error)
+
+    return Counted
 
 
 def _token(request: Request) -> str | None:

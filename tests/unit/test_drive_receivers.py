@@ -474,3 +474,36 @@ def test_websocket_messages_without_a_line_are_silence(web, monkeypatch) -> None
                 sender.send(b"\n" * 1000)
                 time.sleep(0.02)
         assert sink.causes == {"sender": 1}
+
+
+def test_websocket_half_open_connections_are_limited(web) -> None:
+    make, dial = web
+    receiver = make("127.0.0.1", 0)
+    with running(receiver) as sink:
+        crowd = [connect(receiver) for _ in range(40)]
+        sink.until(lambda: sink.causes == {"sender": 8})
+        assert sum(closed_already(sock) for sock in crowd) == 8
+        for sock in crowd:
+            sock.close()
+        sink.until(lambda: can_drive(dial, receiver.address))
+
+
+def closed_already(sock: socket.socket) -> bool:
+    sock.settimeout(0.02)
+    try:
+        return not sock.recv(1)
+    except TimeoutError:
+        return False
+    except ConnectionResetError:
+        return True
+
+
+def can_drive(dial, address: str) -> bool:
+    """Whether a WebSocket opens there."""
+    from websockets.exceptions import WebSocketException
+
+    try:
+        with dial(address):
+            return True
+    except (OSError, EOFError, WebSocketException):
+        return False
