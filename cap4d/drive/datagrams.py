@@ -59,8 +59,9 @@ class DatagramReceiver:
     ) -> None:
         self._allowed = None if sender is None else _addresses(sender)
         self._new_parser, self._clock = parser, clock
-        self._socket = listen(host, port, socket.SOCK_DGRAM, scheme)
-        self._socket.settimeout(POLL)
+        self._scheme = scheme
+        self._open(host, port)
+        self._bound = self._socket.getsockname()[:2]
         self.address = f"{scheme}://{authority(self._socket)}"
         self._parser, self._ruler, self._heard = parser(), None, float("-inf")
         self._budget = Budget(rate=rate)
@@ -68,6 +69,8 @@ class DatagramReceiver:
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
         refused = 0
+        if self._socket.fileno() < 0:  # a run before this one has closed it
+            self._open(*self._bound)
         with self._socket:
             while not stop.is_set():
                 data, sender = self._receive()
@@ -76,6 +79,10 @@ class DatagramReceiver:
                 if refused > MAX_REFUSED:
                     refused = 0
                     stop.wait(BREATH)
+
+    def _open(self, host: str, port: int) -> None:
+        self._socket = listen(host, port, socket.SOCK_DGRAM, self._scheme)
+        self._socket.settimeout(POLL)
 
     def datagram(self, data: bytes, sender: tuple, sink: Sink) -> bool:
         """Takes one in, or counts why not; True: it was of the protocol and of who may send."""

@@ -42,18 +42,15 @@ class UdpReceiver:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.token, self._clock = token, clock
-        self._socket = listen(host, port, socket.SOCK_DGRAM, "udp")
-        self._socket.settimeout(POLL)
-        with contextlib.suppress(OSError):
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-            if SO_RXQ_OVFL is not None:
-                self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        self._open(host, port)
+        self._bound = self._socket.getsockname()[:2]
         self.address = f"udp://{authority(self._socket)}"
-        self._overflowed = 0
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
         gate, refused = Gate(sink, token=self.token), 0
+        if self._socket.fileno() < 0:  # a run before this one has closed it
+            self._open(*self._bound)
         with self._socket:
             while not stop.is_set():
                 data, sender = self._receive(sink)
@@ -61,6 +58,14 @@ class UdpReceiver:
                 if refused > MAX_REFUSED:
                     refused = 0
                     stop.wait(BREATH)
+
+    def _open(self, host: str, port: int) -> None:
+        self._socket, self._overflowed = listen(host, port, socket.SOCK_DGRAM, "udp"), 0
+        self._socket.settimeout(POLL)
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+            if SO_RXQ_OVFL is not None:
+                self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
 
     def _listen_to(self, gate: Gate, sender: object, data: bytes, refused: int) -> int:
         """Looks at a datagram's lines up to one too many; how many were refused in a row."""

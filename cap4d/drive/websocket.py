@@ -57,14 +57,20 @@ class WebSocketReceiver:
         import websockets  # noqa: F401  its absence is told before anything starts
 
         self.token, self._clock = token, clock
-        self._listener = listen(host, port, socket.SOCK_STREAM, "ws")
-        self._listener.listen(MAX_CONNECTIONS)
+        self._open(host, port)
+        self._bound = self._listener.getsockname()[:2]
         self.address = f"ws://{authority(self._listener)}"
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
+        if self._listener.fileno() < 0:  # a run before this one has closed it
+            self._open(*self._bound)
         with self._listener:
             asyncio.run(self._serve(sink, stop))
+
+    def _open(self, host: str, port: int) -> None:
+        self._listener = listen(host, port, socket.SOCK_STREAM, "ws")
+        self._listener.listen(MAX_CONNECTIONS)
 
     async def _serve(self, sink: Sink, stop: threading.Event) -> None:
         from websockets.asyncio.server import serve

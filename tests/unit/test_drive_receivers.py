@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from cap4d.drive import tcp
+from cap4d.drive.livelink import LiveLinkReceiver
 from cap4d.drive.packet import Packet, Receiver
 from cap4d.drive.standard_input import StandardInputReceiver
 from cap4d.drive.tcp import TcpReceiver
@@ -507,3 +508,60 @@ def can_drive(dial, address: str) -> bool:
             return True
     except (OSError, EOFError, WebSocketException):
         return False
+
+
+# started again --------------------------------------------------------------------------------------
+
+
+def test_tcp_can_be_run_again() -> None:
+    receiver = TcpReceiver("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink:
+        sink.until(lambda: can_connect(receiver))
+        with connect(receiver) as sender:
+            sender.sendall(line(1.0))
+            sink.until(lambda: sink.stamps() == [1.0])
+
+
+def test_udp_can_be_run_again() -> None:
+    receiver = UdpReceiver("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink, datagrams(receiver) as send:
+        until_heard(sink, lambda: send(line(1.0)), lambda: sink.packets)
+
+
+def test_live_link_can_be_run_again() -> None:
+    receiver = LiveLinkReceiver("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink, datagrams(receiver) as send:
+        until_heard(sink, lambda: send(b"garbage"), lambda: sink.causes["syntax"])
+
+
+def test_websocket_can_be_run_again(web) -> None:
+    make, dial = web
+    receiver = make("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink:
+        sink.until(lambda: can_drive(dial, receiver.address))
+
+
+def until_heard(sink: Kept, send: Callable[[], None], heard: Callable[[], object]) -> None:
+    """Sends until it is: what comes before the socket is open again is lost."""
+
+    def is_heard() -> bool:
+        send()
+        return bool(heard())
+
+    sink.until(is_heard)
+
+
+def can_connect(receiver: Receiver) -> bool:
+    try:
+        connect(receiver).close()
+    except ConnectionRefusedError:
+        return False
+    return True
