@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from cap4d.drive.gate import SILENCE, Budget
+from cap4d.drive.gate import MAX_RATE, SILENCE, Budget
 from cap4d.drive.packet import Cause, Packet, Rejected, Sink
 from cap4d.drive.tcp import authority, listen
 from cap4d.errors import ArgumentError
@@ -41,6 +41,7 @@ class DatagramReceiver:
         port: 0 for any that is free; `address` names it.
         sender: The only address that may send, by number or by name; None: whoever reaches us.
         parser: Makes a sender's parser.
+        rate: Datagrams a second that the protocol may need; their bytes are limited all the same.
     Raises:
         ArgumentError: There is no listening there, or no such sender.
     """
@@ -53,19 +54,23 @@ class DatagramReceiver:
         *,
         sender: str | None,
         parser: Callable[[], Parser],
+        rate: float = MAX_RATE,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._allowed = None if sender is None else _addresses(sender)
         self._new_parser, self._clock = parser, clock
-        self._socket = listen(host, port, socket.SOCK_DGRAM, scheme)
-        self._socket.settimeout(POLL)
+        self._scheme = scheme
+        self._open(host, port)
+        self._bound = self._socket.getsockname()[:2]
         self.address = f"{scheme}://{authority(self._socket)}"
         self._parser, self._ruler, self._heard = parser(), None, float("-inf")
-        self._budget = Budget()
+        self._budget = Budget(rate=rate)
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
         refused = 0
+        if self._socket.fileno() < 0:  # a run before this one has closed it
+            self._open(*self._bound)
         with self._socket:
             while not stop.is_set():
                 data, sender = self._receive()
@@ -74,6 +79,10 @@ class DatagramReceiver:
                 if refused > MAX_REFUSED:
                     refused = 0
                     stop.wait(BREATH)
+
+    def _open(self, host: str, port: int) -> None:
+        self._socket = listen(host, port, socket.SOCK_DGRAM, self._scheme)
+        self._socket.settimeout(POLL)
 
     def datagram(self, data: bytes, sender: tuple, sink: Sink) -> bool:
         """Takes one in, or counts why not; True: it was of the protocol and of who may send."""
@@ -91,13 +100,13 @@ class DatagramReceiver:
     def _admit(self, sender: tuple, size: int, now: float) -> None:
         if self._allowed is not None and _number(sender[0]) not in self._allowed:
             raise Rejected(Cause.SENDER, "of an address that may not send")
+        is_another = self._ruler not in (None, sender[:2])
+        if is_another and now - self._heard <= SILENCE:  # not at the cost of who rules
+            raise Rejected(Cause.SENDER, "another one sends already")
         if not self._budget.take(size, now):
             raise Rejected(Cause.FLOOD, "more datagrams than any sender needs")
-        if self._ruler in (None, sender[:2]):
-            return
-        if now - self._heard <= SILENCE:
-            raise Rejected(Cause.SENDER, "another one sends already")
-        self._ruler, self._parser = None, self._new_parser()
+        if is_another:
+            self._ruler, self._parser = None, self._new_parser()
 
     def _receive(self) -> tuple[bytes, tuple | None]:
         """A datagram and who sent it; None where none came."""

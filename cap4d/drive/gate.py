@@ -89,18 +89,19 @@ class Budget:
 
     Args:
         times: The limits of so many senders.
+        rate: Frames a second of a sender.
     """
 
-    def __init__(self, times: float = 1.0) -> None:
-        self._times = times
-        self._frames, self._bytes = times * BURST, times * BYTES_BURST
+    def __init__(self, times: float = 1.0, *, rate: float = MAX_RATE) -> None:
+        self._times, self._rate, self._burst = times, times * rate, times * rate * BURST / MAX_RATE
+        self._frames, self._bytes = self._burst, times * BYTES_BURST
         self._now = float("-inf")
 
     def take(self, size: int, now: float) -> bool:
         """Whether a line of `size` bytes may pass at `now` s."""
         elapsed = min(max(now - self._now, 0.0), 1.0)
         self._now = max(self._now, now)
-        self._frames = min(self._frames + self._times * MAX_RATE * elapsed, self._times * BURST)
+        self._frames = min(self._frames + self._rate * elapsed, self._burst)
         self._bytes = min(self._bytes + self._times * MAX_BYTES * elapsed, self._times * BYTES_BURST)
         passes = self._frames >= 1 and self._bytes >= size
         if passes:

@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 
 RETRY_SECONDS = 1.0  # until a receiver that failed is tried again
 STOP_SECONDS = 1.0  # that a receiver gets to end
+MAX_DETAIL = 256  # characters of it in a log line
 
 Fill = Callable[[Frame, float], Frame]
 """(frame, now) -> the frame with what its source lacks: blinks, gaze, a breathing neck."""
@@ -182,7 +183,8 @@ class LiveStream:
         """One line for the first frame of each cause; the counts say the rest."""
         if cause not in self._told:
             self._told.add(cause)
-            log.warning("%s: a frame was refused: %s%s", self.address, cause, f": {detail}" * bool(detail))
+            told = f": {_printable(detail)}" if detail else ""
+            log.warning("%s: a frame was refused: %s%s", self.address, cause, told)
 
     def _sound(self, frame: Frame) -> Frame:
         if frame.expr.shape != self._shape:
@@ -205,3 +207,8 @@ class LiveStream:
             except Exception:
                 log.exception("%s: the receiver failed and is started again", self.address)
                 self._stop.wait(RETRY_SECONDS)
+
+
+def _printable(text: str) -> str:
+    """Strangers' words for a log line: not too many, and no control characters, which a terminal obeys."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[:MAX_DETAIL])

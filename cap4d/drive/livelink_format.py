@@ -11,11 +11,12 @@ from cap4d.drive.packet import Packet
 from cap4d.rotation import axis_angle_to_rotmat
 
 RATE = 60  # frames a second of the time code
+DAY = 24 * 3600.0  # s, after which time codes start again
 
 
 def format_livelink(packet: Packet, *, device: str = "cap4d", subject: str = "cap4d") -> bytes:
     """The packet of `arkit` weights, gaze, and how the head turns, where it has no place (`tra`) besides."""
-    position = packet.t * RATE
+    position = packet.t % DAY * RATE
     frame = int(np.floor(position))
     words = b"".join(struct.pack(">I", len(word)) + word for word in (device.encode(), subject.encode()))
     values = np.concatenate([packet.arkit, angles_of_pose(packet)]).astype(">f4").tobytes()

@@ -48,5 +48,5 @@ def unread(file: int) -> int:
         import termios
 
         return struct.unpack("@i", fcntl.ioctl(file, termios.FIONREAD, bytes(4)))[0]
-    except (ImportError, OSError):
+    except (ImportError, OSError, ValueError):  # ValueError: it is closed, and its number -1
         return 0

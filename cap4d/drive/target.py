@@ -151,9 +151,11 @@ class WebSocketConnection:
     def send(self, message: bytes) -> None:
         """See `Connection`. Text where it is text; garbage goes as it is."""
         try:
-            self._socket.send(message.decode())
+            said: str | bytes = message.decode()
         except UnicodeDecodeError:
-            self._socket.send(message)
+            said = message
+        try:
+            self._socket.send(said)
         except self._broken as error:
             raise ConnectionResetError(str(error)) from error
 

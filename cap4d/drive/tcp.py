@@ -46,12 +46,14 @@ class TcpReceiver:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.token, self._clock = token, clock
-        self._listener = listen(host, port, socket.SOCK_STREAM, "tcp")
-        self._listener.listen(MAX_CONNECTIONS)
+        self._open(host, port)
+        self._bound = self._listener.getsockname()[:2]
         self.address = f"tcp://{authority(self._listener)}"
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
+        if self._listener.fileno() < 0:  # a run before this one has closed it
+            self._open(*self._bound)
         with self._listener, selectors.DefaultSelector() as selector:
             selector.register(self._listener, selectors.EVENT_READ)
             server = _Server(sink, selector, self._listener, self.token)
@@ -60,6 +62,10 @@ class TcpReceiver:
                     server.turn(self._clock)
             finally:
                 server.close()
+
+    def _open(self, host: str, port: int) -> None:
+        self._listener = listen(host, port, socket.SOCK_STREAM, "tcp")
+        self._listener.listen(MAX_CONNECTIONS)
 
 
 class _Connection:

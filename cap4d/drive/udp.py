@@ -13,6 +13,7 @@ from collections.abc import Callable
 from cap4d.drive.gate import Gate
 from cap4d.drive.packet import Cause, Sink
 from cap4d.drive.tcp import authority, listen
+from cap4d.drive.wire import lines_of
 
 MAX_DATAGRAM = 1 << 16
 RECEIVE_BUFFER = 1 << 20  # bytes the system keeps for us
@@ -41,27 +42,40 @@ class UdpReceiver:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.token, self._clock = token, clock
-        self._socket = listen(host, port, socket.SOCK_DGRAM, "udp")
+        self._open(host, port)
+        self._bound = self._socket.getsockname()[:2]
+        self.address = f"udp://{authority(self._socket)}"
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """See `packet.Receiver`."""
+        gate, refused = Gate(sink, token=self.token), 0
+        if self._socket.fileno() < 0:  # a run before this one has closed it
+            self._open(*self._bound)
+        with self._socket:
+            while not stop.is_set():
+                data, sender = self._receive(sink)
+                refused = self._listen_to(gate, sender, data, refused)
+                if refused > MAX_REFUSED:
+                    refused = 0
+                    stop.wait(BREATH)
+
+    def _open(self, host: str, port: int) -> None:
+        self._socket, self._overflowed = listen(host, port, socket.SOCK_DGRAM, "udp"), 0
         self._socket.settimeout(POLL)
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
             if SO_RXQ_OVFL is not None:
                 self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
-        self.address = f"udp://{authority(self._socket)}"
-        self._overflowed = 0
 
-    def run(self, sink: Sink, stop: threading.Event) -> None:
-        """See `packet.Receiver`."""
-        gate, refused = Gate(sink, token=self.token), 0
-        with self._socket:
-            while not stop.is_set():
-                data, sender = self._receive(sink)
-                for line in data.split(b"\n"):
-                    if line.strip():
-                        refused = refused + 1 if gate.line(sender, line, self._clock()) is None else 0
-                if refused > MAX_REFUSED:
-                    refused = 0
-                    stop.wait(BREATH)
+    def _listen_to(self, gate: Gate, sender: object, data: bytes, refused: int) -> int:
+        """Looks at a datagram's lines up to one too many; how many were refused in a row."""
+        lines = lines_of(data)
+        for done, line in enumerate(lines, 1):
+            refused = refused + 1 if gate.line(sender, line, self._clock()) is None else 0
+            if gate.flooded:
+                gate.sink.rejected(Cause.FLOOD, times=len(lines) - done)
+                break
+        return refused
 
     def _receive(self, sink: Sink) -> tuple[bytes, object]:
         """A datagram and who sent it; an empty one where none came."""

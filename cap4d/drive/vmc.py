@@ -21,6 +21,7 @@ from cap4d.drive.packet import Cause, Packet, Rejected
 from cap4d.rotation import quat_to_rotmat, rotmat_to_axis_angle
 
 BLEND, APPLY, BONE, TIME = "/VMC/Ext/Blend/Val", "/VMC/Ext/Blend/Apply", "/VMC/Ext/Bone/Pos", "/VMC/Ext/T"
+MAX_RATE = 10_000.0  # datagrams a second: many programs send each message, some 60 a frame, by itself
 MAX_WEIGHT = 2.0  # of weights that are 0 to 1
 CLOCK_SECONDS = 0.5  # to wait for a sender's clock, before frames bear the time they come at
 BONES = ("Neck", "Head", "LeftEye", "RightEye")
@@ -63,7 +64,7 @@ class VmcReceiver(DatagramReceiver):
     """Listens for such a program; see `packet.Receiver`. Other arguments: see `DatagramReceiver`."""
 
     def __init__(self, host: str, port: int, sender: str | None = None, **keywords) -> None:
-        super().__init__("vmc", host, port, sender=sender, parser=VmcParser, **keywords)
+        super().__init__("vmc", host, port, sender=sender, parser=VmcParser, rate=MAX_RATE, **keywords)
 
 
 class VmcParser:

@@ -79,13 +79,17 @@ class WebcamReceiver:
         """
         with self._detector() as detector:
             driver = FaceDriver(self._head if self._head is not None else _look_at(self._bundle))
-            filming = threading.Thread(target=self._film, args=(stop,), name="webcam", daemon=True)
+            over = threading.Event()  # of this run: one that fails leaves no thread with the camera
+            filming = threading.Thread(target=self._film, args=(over,), name="webcam", daemon=True)
             filming.start()
-            while not stop.is_set():
-                taken = self._pictures.take(PATIENCE)
-                if taken is not None:
-                    self._drive(driver, detector, *taken, sink)
-            filming.join(PATIENCE)
+            try:
+                while not stop.is_set():
+                    taken = self._pictures.take(PATIENCE)
+                    if taken is not None:
+                        self._drive(driver, detector, *taken, sink)
+            finally:
+                over.set()
+                filming.join(PATIENCE)
 
     def statistics(self) -> dict[str, Any]:
         """Pictures taken, dropped, and without a face; reconnects; packets per second and median ms."""

@@ -22,13 +22,14 @@ from cap4d.drive.gate import Gate
 from cap4d.drive.pace import Pace, unread
 from cap4d.drive.packet import Cause, Sink
 from cap4d.drive.tcp import FLOODED, GREETING, IDLE, MAX_CONNECTIONS, authority, listen
-from cap4d.drive.wire import MAX_LINE, same_token
+from cap4d.drive.wire import MAX_LINE, lines_of, same_token
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 POLL = 0.1  # s
+MAX_OPEN = 32  # connections on the port, half-open ones counted
 LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 TRY_AGAIN_LATER, POLICY = 1013, 1008  # close codes, RFC 6455 7.4.1 and IANA's registry
 
@@ -56,14 +57,20 @@ class WebSocketReceiver:
         import websockets  # noqa: F401  its absence is told before anything starts
 
         self.token, self._clock = token, clock
-        self._listener = listen(host, port, socket.SOCK_STREAM, "ws")
-        self._listener.listen(MAX_CONNECTIONS)
+        self._open(host, port)
+        self._bound = self._listener.getsockname()[:2]
         self.address = f"ws://{authority(self._listener)}"
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
+        if self._listener.fileno() < 0:  # a run before this one has closed it
+            self._open(*self._bound)
         with self._listener:
             asyncio.run(self._serve(sink, stop))
+
+    def _open(self, host: str, port: int) -> None:
+        self._listener = listen(host, port, socket.SOCK_STREAM, "ws")
+        self._listener.listen(MAX_CONNECTIONS)
 
     async def _serve(self, sink: Sink, stop: threading.Event) -> None:
         from websockets.asyncio.server import serve
@@ -73,6 +80,7 @@ class WebSocketReceiver:
             visitors.drive,
             sock=self._listener,
             process_request=visitors.admit,
+            create_connection=_counted(visitors),
             compression=None,
             max_size=MAX_LINE,
             max_queue=16,
@@ -93,6 +101,7 @@ class _Visitors:
     def __init__(self, sink: Sink, token: str | None, clock: Callable[[], float]) -> None:
         self.sink, self.token, self.clock = sink, token, clock
         self.gate, self.count = Gate(sink), 0
+        self.open = 0  # connections, those included that have not said yet what they want
 
     def admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuses who lacks the token, comes from a foreign page, or is one too many."""
@@ -123,17 +132,20 @@ class _Visitors:
             self.gate.leave(connection)
 
     async def _listen_to(self, connection: ServerConnection) -> None:
-        pace, patience = Pace(), GREETING
+        pace, due = Pace(), self.clock() + GREETING
         while True:
             try:
-                message = await asyncio.wait_for(connection.recv(decode=False), patience)
+                message = await asyncio.wait_for(connection.recv(decode=False), due - self.clock())
             except TimeoutError:
                 self.sink.rejected(Cause.SENDER, "a connection is silent")
                 return await connection.close(POLICY, "silent")
-            patience = IDLE
+            lines = deque(lines_of(message))
+            if not lines:  # as good as silence, and no faster
+                await asyncio.sleep(POLL)
+                continue
+            due = self.clock() + IDLE
             if not self.gate.rules(connection, self.clock()):
                 await asyncio.sleep(POLL)  # for one who rules to have hung up just now
-            lines = deque(line for line in message.split(b"\n") if line.strip())
             while lines:
                 now = self.clock()
                 line = lines.popleft()
@@ -147,6 +159,25 @@ class _Visitors:
                 elif t is not None:
                     waiting = unread(connection.transport.get_extra_info("socket").fileno())
                     await asyncio.sleep(pace.lead(t, now, size=len(line), waiting=waiting))
+
+
+def _counted(visitors: _Visitors) -> type[ServerConnection]:
+    """Connections that are counted, and cut where there are too many."""
+    from websockets.asyncio.server import ServerConnection
+
+    class Counted(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            visitors.open += 1
+            super().connection_made(transport)
+            if visitors.open > MAX_OPEN:
+                visitors.sink.rejected(Cause.SENDER, f"{MAX_OPEN} connections are open already")
+                transport.abort()
+
+        def connection_lost(self, error: Exception | None) -> None:
+            visitors.open -= 1
+            super().connection_lost(error)
+
+    return Counted
 
 
 def _token(request: Request) -> str | None:

@@ -30,6 +30,7 @@ MAX_COMMAS, MAX_BRACKETS = 5000, 64  # bounds what parsing a line costs, before 
 MAX_MAGNITUDE = 1e6  # m, rad or expression units; nothing on a face comes near it
 MAX_TIME = 1e11  # s; Unix time is below 1e10
 MAX_NAME = 256
+MAX_BLANK = 2  # lines in a row that are passed over: between frames, and at the end
 TURNS = ("eye_rot", "neck_rot", "jaw_rot", "rot", "tra")
 KINDS = ("expr", "arkit", "vertices")
 COLUMN = {name: i for i, name in enumerate(NAMES)}
@@ -121,6 +122,12 @@ def format_token(token: str) -> bytes:
     return json.dumps({"token": token}).encode() + b"\n"
 
 
+def lines_of(message: bytes) -> list[bytes]:
+    """The lines of a datagram or message, those that are blank within it too; none where all are."""
+    message = message.strip()
+    return message.split(b"\n") if message else []
+
+
 class LineSplitter:
     """Bytes as they come -> lines, in bounded memory.
 
@@ -133,19 +140,25 @@ class LineSplitter:
         self._held = bytearray()
         self._searched = 0  # of `_held`, no newline in it
         self._skipping = False
+        self._blank = 0  # lines in a row
 
     def feed(self, data: bytes) -> Iterator[bytes | None]:
-        """The lines that `data` completes, without blank ones; None for each that is too long."""
+        """The lines that `data` completes; None for each that is too long.
+
+        Blank ones are left out, but for those of more than `MAX_BLANK` in a row: these cost the sender as
+        any line does.
+        """
         self._held += data
         start = 0
         while (end := self._held.find(b"\n", max(start, self._searched))) >= 0:
             line, start = bytes(self._held[start : min(end, start + self.limit + 1)]), end + 1
             self._searched = 0
+            self._blank = 0 if line.strip() else self._blank + 1
             if self._skipping:  # its end; it was told of
                 self._skipping = False
             elif len(line) > self.limit:
                 yield None
-            elif line.strip():
+            elif not 0 < self._blank <= MAX_BLANK:
                 yield line
         del self._held[:start]
         self._searched = len(self._held)

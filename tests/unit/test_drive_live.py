@@ -113,6 +113,15 @@ def test_every_refused_frame_is_counted_by_its_cause(caplog) -> None:
     assert sum("flood" in line for line in caplog.messages) == 1  # the first of a cause is told of, no more
 
 
+def test_strangers_words_are_told_without_control_characters_and_cut(caplog) -> None:
+    live = stream()
+    live.rejected(Cause.FIELD, "ä\x1b[2J\r\n\u202e\ud800" + 1_000_000 * "\x00")
+    live.rejected(Cause.RIG, 1_000_000 * "x")
+    first, second = caplog.messages
+    assert r"field: ä\x1b[2J\r\n\u202e\ud800\x00" in first and first.isprintable()
+    assert len(first) < 1200 and len(second) < 400
+
+
 def test_what_fills_in_sees_frame_and_time_and_may_not_stop_the_show(caplog) -> None:
     def fill(frame: Frame, now: float) -> Frame:
         if now > 101:

@@ -285,6 +285,17 @@ def test_a_flood_is_bounded() -> None:
     receiver._socket.close()
 
 
+def test_a_flood_of_another_sender_does_not_silence_who_rules() -> None:
+    receiver, sink = LiveLinkReceiver("127.0.0.1", 0, clock=lambda: 0.0), Listener()
+    receiver._socket.close()
+    data = packet(values_of())
+    assert receiver.datagram(data, ("10.0.0.1", 5), sink)
+    for _ in range(1000):
+        receiver.datagram(data, ("10.0.0.2", 5), sink)
+    assert receiver.datagram(data, ("10.0.0.1", 5), sink)
+    assert sink.causes == [Cause.SENDER] * 1000
+
+
 HEADER = ["Timecode", "BlendShapeCount"] + [name[0].upper() + name[1:] for name in NAMES] + list(ANGLES)
 
 

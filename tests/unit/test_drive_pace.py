@@ -66,4 +66,4 @@ def test_the_system_says_what_is_unread() -> None:
     finally:
         os.close(reader)
         os.close(writer)
-    assert unread(reader) == 0  # closed
+    assert unread(reader) == unread(-1) == 0  # closed, as a pipe and as a socket

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from cap4d.drive import tcp
+from cap4d.drive.livelink import LiveLinkReceiver
 from cap4d.drive.packet import Packet, Receiver
 from cap4d.drive.standard_input import StandardInputReceiver
 from cap4d.drive.tcp import TcpReceiver
@@ -33,6 +34,7 @@ class Kept:
         self.packets: list[Packet] = []
         self.arrivals: list[float] = []
         self.causes: Counter[str] = Counter()
+        self.refusals = 0  # calls of `rejected`
 
     def packet(self, packet: Packet, arrival: float) -> bool:
         if packet.rig_name != "tiny":
@@ -44,6 +46,7 @@ class Kept:
 
     def rejected(self, cause, detail="", *, times=1) -> None:
         self.causes[str(cause)] += times
+        self.refusals += 1
 
     def until(self, condition: Callable[[], bool]) -> None:
         end = time.monotonic() + PATIENCE
@@ -204,6 +207,13 @@ def test_tcp_a_flood_is_cut_and_the_work_bounded() -> None:
         assert used < 0.5  # s of a second, the sender's share among them
 
 
+def test_tcp_a_flood_of_blank_lines_is_one() -> None:
+    receiver = TcpReceiver("127.0.0.1", 0)
+    with running(receiver) as sink, connect(receiver) as sender:
+        sender.sendall(b"\n" * 60_000)
+        sink.until(lambda: sink.causes["flood"] > 50_000)
+
+
 def test_tcp_a_file_poured_in_plays_at_its_own_speed() -> None:
     receiver = TcpReceiver("127.0.0.1", 0)
     with running(receiver) as sink, connect(receiver) as sender:
@@ -262,6 +272,14 @@ def test_udp_asks_for_the_token_in_every_datagram() -> None:
             send(data)
         sink.until(lambda: sink.causes["token"] == 3)
         assert sink.stamps() == [3.0]
+
+
+def test_udp_a_datagram_of_many_lines_is_left_at_the_first_too_many() -> None:
+    receiver = UdpReceiver("127.0.0.1", 0)
+    with running(receiver) as sink, datagrams(receiver) as send:
+        send(b"x\n" * 30_000)
+        sink.until(lambda: sum(sink.causes.values()) == 30_000)
+        assert sink.causes["flood"] > 29_000 and sink.refusals < 1000
 
 
 def test_udp_a_flood_is_cut_even_where_the_system_drops_it() -> None:
@@ -442,3 +460,108 @@ def test_websocket_connections_that_say_nothing_are_hung_up_on(web, monkeypatch)
             half_open.sendall(b"GET / HTT")
             closed(half_open)
         assert sink.causes == {"sender": 1}
+
+
+def test_websocket_messages_without_a_line_are_silence(web, monkeypatch) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    make, dial = web
+    monkeypatch.setattr("cap4d.drive.websocket.GREETING", 0.3)
+    receiver = make("127.0.0.1", 0)
+    with running(receiver) as sink:
+        with dial(receiver.address) as sender, pytest.raises(ConnectionClosed, match="silent"):
+            end = time.monotonic() + PATIENCE
+            while time.monotonic() < end:
+                sender.send(b"\n" * 1000)
+                time.sleep(0.02)
+        assert sink.causes == {"sender": 1}
+
+
+def test_websocket_half_open_connections_are_limited(web) -> None:
+    make, dial = web
+    receiver = make("127.0.0.1", 0)
+    with running(receiver) as sink:
+        crowd = [connect(receiver) for _ in range(40)]
+        sink.until(lambda: sink.causes == {"sender": 8})
+        assert sum(closed_already(sock) for sock in crowd) == 8
+        for sock in crowd:
+            sock.close()
+        sink.until(lambda: can_drive(dial, receiver.address))
+
+
+def closed_already(sock: socket.socket) -> bool:
+    sock.settimeout(0.02)
+    try:
+        return not sock.recv(1)
+    except TimeoutError:
+        return False
+    except ConnectionResetError:
+        return True
+
+
+def can_drive(dial, address: str) -> bool:
+    """Whether a WebSocket opens there."""
+    from websockets.exceptions import WebSocketException
+
+    try:
+        with dial(address):
+            return True
+    except (OSError, EOFError, WebSocketException):
+        return False
+
+
+# started again --------------------------------------------------------------------------------------
+
+
+def test_tcp_can_be_run_again() -> None:
+    receiver = TcpReceiver("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink:
+        sink.until(lambda: can_connect(receiver))
+        with connect(receiver) as sender:
+            sender.sendall(line(1.0))
+            sink.until(lambda: sink.stamps() == [1.0])
+
+
+def test_udp_can_be_run_again() -> None:
+    receiver = UdpReceiver("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink, datagrams(receiver) as send:
+        until_heard(sink, lambda: send(line(1.0)), lambda: sink.packets)
+
+
+def test_live_link_can_be_run_again() -> None:
+    receiver = LiveLinkReceiver("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink, datagrams(receiver) as send:
+        until_heard(sink, lambda: send(b"garbage"), lambda: sink.causes["syntax"])
+
+
+def test_websocket_can_be_run_again(web) -> None:
+    make, dial = web
+    receiver = make("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink:
+        sink.until(lambda: can_drive(dial, receiver.address))
+
+
+def until_heard(sink: Kept, send: Callable[[], None], heard: Callable[[], object]) -> None:
+    """Sends until it is: what comes before the socket is open again is lost."""
+
+    def is_heard() -> bool:
+        send()
+        return bool(heard())
+
+    sink.until(is_heard)
+
+
+def can_connect(receiver: Receiver) -> bool:
+    try:
+        connect(receiver).close()
+    except ConnectionRefusedError:
+        return False
+    return True

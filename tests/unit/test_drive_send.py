@@ -277,6 +277,23 @@ def test_a_websocket_gets_a_message_a_frame_and_the_token_in_its_address(fit):
     )
 
 
+def test_garbage_to_a_websocket_that_hung_up_is_a_failure_to_send():
+    pytest.importorskip("websockets")
+    from websockets.sync.server import serve
+
+    with serve(lambda socket: None, "127.0.0.1", 0) as server:  # hangs up at once
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        target = open_target(f"ws://127.0.0.1:{server.socket.getsockname()[1]}")
+        assert target.connected(0.0)
+        end = time.monotonic() + 5
+        while sent := target.send(b"\xff\n", 0.0):
+            assert time.monotonic() < end
+        server.shutdown()
+        thread.join()
+    assert not sent and "1000" in target.reason
+
+
 def test_a_websocket_that_refuses_says_why():
     pytest.importorskip("websockets")
     from websockets.sync.server import serve
@@ -301,6 +318,12 @@ def test_live_link_face_packets_are_written_byte_by_byte():
     assert data[30] == 61
     values = struct.unpack(">61f", data[31:])
     assert values == (*arkit.tolist(), *[0.0] * 9)
+
+
+@pytest.mark.parametrize(("t", "of_day"), [(1.8e9 + 0.5, 28800.5), (-1.0, 86399.0), (1e11, 35200.0)])
+def test_any_time_becomes_a_time_code_of_the_day(t, of_day):
+    back = parse_livelink(format_livelink(Packet(t, arkit=np.zeros(52, np.float32))))
+    assert back.t == pytest.approx(of_day, abs=1e-4)
 
 
 def test_what_is_written_is_read_back_gaze_and_head_too():

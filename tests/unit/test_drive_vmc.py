@@ -215,3 +215,27 @@ def test_the_receiver_forgets_a_sender_who_left() -> None:
     receiver._socket.close()
     assert [shown(packet) for packet in packets] == [{"jawOpen": 1}, {"mouthPucker": 1}]
     assert receiver.address.startswith("vmc://127.0.0.1:")
+
+
+def test_a_sender_of_a_datagram_a_message_is_no_flood_and_ten_times_that_is() -> None:
+    """53 shapes, the clock and `Apply`, each by itself, at 60 Hz: as many programs send them."""
+    now, frames, causes = [0.0], [], []
+
+    class Sink:
+        def packet(self, packet: Packet, arrival: float) -> bool:
+            frames.append(packet)
+            return True
+
+        def rejected(self, cause: Cause, detail: str = "", *, times: int = 1) -> None:
+            causes.append(cause)
+
+    receiver = VmcReceiver("127.0.0.1", 0, clock=lambda: now[0])
+    receiver._socket.close()
+    for frame in range(60):
+        now[0] = frame / 60
+        for data in (clock(frame / 60), *blend(JawOpen=0.5) * 53, APPLY):
+            receiver.datagram(data, ("10.0.0.1", 1), Sink())
+    assert len(frames) == 60 and not causes
+    for _ in range(30_000):
+        receiver.datagram(APPLY, ("10.0.0.1", 1), Sink())
+    assert causes.count(Cause.FLOOD) > 20_000

@@ -163,6 +163,25 @@ def test_it_stops_while_the_camera_hangs():
     hangs.set()
 
 
+def test_a_run_that_fails_lets_go_of_the_camera(monkeypatch):
+    monkeypatch.setattr(webcam, "PATIENCE", LONG)
+    script, stop = Script(range(9)), threading.Event()
+    script.dealt = threading.Semaphore(100)
+
+    def landmarks(picture):
+        raise ZeroDivisionError
+
+    script.landmarks = landmarks
+    receiver = WebcamReceiver("0", None, camera=script.open, detector=script.detector, head=landmark_head())
+    before = set(threading.enumerate())
+    try:
+        with pytest.raises(ZeroDivisionError):
+            receiver.run(Got(), stop)
+        assert set(threading.enumerate()) == before and script.closed == 1
+    finally:
+        stop.set()
+
+
 @pytest.mark.parametrize("device", ["webcam://front door", "webcam:///no/such.mp4", "webcam://"])
 def test_a_device_that_is_none_is_refused(device):
     with pytest.raises(ArgumentError, match="webcam: expected webcam://0"):

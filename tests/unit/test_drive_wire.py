@@ -16,6 +16,7 @@ from cap4d.drive.wire import (
     check_token,
     format_packet,
     format_token,
+    lines_of,
     parse_object,
     parse_packet,
 )
@@ -152,3 +153,11 @@ def test_a_line_without_end_holds_no_memory() -> None:
     lines = [line for _ in range(10_000) for line in splitter.feed(b"z" * 999)]
     assert lines == [None] and len(splitter._held) <= 1000
     assert list(splitter.feed(b"zz\nnext\n")) == [b"next"]
+
+
+def test_blank_lines_cost_as_others_do_but_for_the_odd_one() -> None:
+    splitter = LineSplitter()
+    assert list(splitter.feed(b"\none\n\ntwo\r\n \r\n\nthree\n\n")) == [b"one", b"two\r", b"three"]
+    assert len(list(splitter.feed(b"\n" * 100))) == 99
+    assert list(splitter.feed(b"four\n\n")) == [b"four"]
+    assert lines_of(b"\none\n\ntwo\r\n\n") == [b"one", b"", b"two"] and lines_of(b" \r\n" * 100) == []
