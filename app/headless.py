@@ -60,6 +60,8 @@ def _play_live_source(path: Path, avatar: Avatar, options: Options) -> None:
         *(out, stats["frames"], stats["fps"], backend, drive["received"], sum(drive["rejected"].values())),
         *(drive["latency_ms"]["median"], drive["latency_ms"]["p95"]),
     )
+    if not drive["shown"]:
+        log.warning("%s: no frame came that could be shown: the face is at rest", drive["source"])
 
 
 def choose_backend(wanted: str, avatar: Avatar) -> tuple[str, Draw]:

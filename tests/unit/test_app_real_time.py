@@ -86,13 +86,14 @@ def test_a_sender_over_tcp_is_drawn_for_as_many_pictures_as_asked_for(folder, ca
     assert stats["drive"]["received"] > 30 and stats["drive"]["interpolated"] > 10
 
 
-def test_ctrl_c_ends_the_file_where_it_is(folder) -> None:
+def test_ctrl_c_ends_the_file_where_it_is(folder, caplog) -> None:
     timer = threading.Timer(1.0, lambda: os.kill(os.getpid(), signal.SIGINT))
     timer.start()
     assert view("--drive udp://127.0.0.1:0 --out out.mp4 --stats stats.json") == 0
     timer.join()
     assert (folder / "out.mp4").stat().st_size > 500
     assert json.loads((folder / "stats.json").read_text())["drive"]["state"] == "waiting"
+    assert "no frame came that could be shown" in caplog.text
 
 
 def test_a_sound_goes_into_the_file_of_a_live_source(folder) -> None:
