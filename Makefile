@@ -46,7 +46,7 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/system
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' || { echo "cap4d builds with Python 3.11 or 3.12; set PYTHON=..."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install -c constraints.txt torch
-	$(PIP) install -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; o = p["optional-dependencies"]; print(*sorted({"".join(r.split()) for r in sum((o[e] for e in ("live", "capture", "track", "fit", "dev")), p["dependencies"]) if not r.startswith("cap4d")}))')
+	$(PIP) install -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; o = p["optional-dependencies"]; print(*sorted({"".join(r.split()) for r in sum((o[e] for e in ("live", "webcam", "capture", "track", "fit", "dev")), p["dependencies"]) if not r.startswith("cap4d")}))')
 	$(PIP) install --no-deps -c constraints.txt mediapipe
 	@touch $@
 
