@@ -9,14 +9,10 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from cap4d.drive.datagram_socket import DatagramSocket
 from cap4d.drive.gate import MAX_RATE, SILENCE, Budget
 from cap4d.drive.packet import Cause, Packet, Rejected, Sink
-from cap4d.drive.tcp import authority, listen
 from cap4d.errors import ArgumentError
-
-MAX_DATAGRAM = 1 << 16
-POLL = 0.1  # s
-MAX_REFUSED, BREATH = 64, 10e-3  # datagrams refused in a row, after which to let the system drop some; s
 
 
 class Parser(Protocol):
@@ -36,9 +32,7 @@ class DatagramReceiver:
     The first sender of a frame that is taken rules, until it is silent for a second.
 
     Args:
-        scheme: Of `address`.
-        host: To listen on.
-        port: 0 for any that is free; `address` names it.
+        scheme, host, port: See `Listener`.
         sender: The only address that may send, by number or by name; None: whoever reaches us.
         parser: Makes a sender's parser.
         rate: Datagrams a second that the protocol may need; their bytes are limited all the same.
@@ -59,30 +53,18 @@ class DatagramReceiver:
     ) -> None:
         self._allowed = None if sender is None else _addresses(sender)
         self._new_parser, self._clock = parser, clock
-        self._scheme = scheme
-        self._open(host, port)
-        self._bound = self._socket.getsockname()[:2]
-        self.address = f"{scheme}://{authority(self._socket)}"
+        self._socket = DatagramSocket(scheme, host, port)
+        self.address = self._socket.address
         self._parser, self._ruler, self._heard = parser(), None, float("-inf")
         self._budget = Budget(rate=rate)
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
-        refused = 0
-        if self._socket.fileno() < 0:  # a run before this one has closed it
-            self._open(*self._bound)
-        with self._socket:
-            while not stop.is_set():
-                data, sender = self._receive()
-                if sender is not None:
-                    refused = 0 if self.datagram(data, sender, sink) else refused + 1
-                if refused > MAX_REFUSED:
-                    refused = 0
-                    stop.wait(BREATH)
 
-    def _open(self, host: str, port: int) -> None:
-        self._socket = listen(host, port, socket.SOCK_DGRAM, self._scheme)
-        self._socket.settimeout(POLL)
+        def take(data: bytes, sender: tuple, refused: int) -> int:
+            return 0 if self.datagram(data, sender, sink) else refused + 1
+
+        self._socket.run(take, sink, stop)
 
     def datagram(self, data: bytes, sender: tuple, sink: Sink) -> bool:
         """Takes one in, or counts why not; True: it was of the protocol and of who may send."""
@@ -107,13 +89,6 @@ class DatagramReceiver:
             raise Rejected(Cause.FLOOD, "more datagrams than any sender needs")
         if is_another:
             self._ruler, self._parser = None, self._new_parser()
-
-    def _receive(self) -> tuple[bytes, tuple | None]:
-        """A datagram and who sent it; None where none came."""
-        try:
-            return self._socket.recvfrom(MAX_DATAGRAM)
-        except OSError:  # time is up; or what we never sent could not be delivered, as Windows says
-            return b"", None
 
 
 def _addresses(sender: str) -> set[str]:

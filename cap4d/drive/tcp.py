@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import selectors
 import socket
 import threading
@@ -13,12 +12,11 @@ from collections import deque
 from collections.abc import Callable
 
 from cap4d.drive.gate import Gate
+from cap4d.drive.listener import MAX_CONNECTIONS, Listener
 from cap4d.drive.pace import Pace, unread
 from cap4d.drive.packet import Cause, Rejected, Sink
 from cap4d.drive.wire import LineSplitter, check_token, parse_object
-from cap4d.errors import ArgumentError
 
-MAX_CONNECTIONS = 8
 READ = 1 << 16  # bytes at once
 GREETING = 5.0  # s in which a connection has to bring its first frame
 IDLE = 60.0  # s without a line, after which a connection is taken for dead
@@ -30,42 +28,29 @@ class TcpReceiver:
     """A listening socket; see `packet.Receiver`.
 
     Args:
-        host: To listen on.
-        port: 0 for any that is free; `address` names it.
+        host, port: See `Listener`.
         token: What the first line, `{"token": "..."}`, has to say; None for no such line.
     Raises:
         ArgumentError: There is no listening there.
     """
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        token: str | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, host: str, port: int, *, token: str | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.token, self._clock = token, clock
-        self._open(host, port)
-        self._bound = self._listener.getsockname()[:2]
-        self.address = f"tcp://{authority(self._listener)}"
+        self._listener = Listener("tcp", host, port, socket.SOCK_STREAM)
+        self.address = self._listener.address
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
-        if self._listener.fileno() < 0:  # a run before this one has closed it
-            self._open(*self._bound)
-        with self._listener, selectors.DefaultSelector() as selector:
-            selector.register(self._listener, selectors.EVENT_READ)
-            server = _Server(sink, selector, self._listener, self.token)
+        with self._listener as listener, selectors.DefaultSelector() as selector:
+            selector.register(listener, selectors.EVENT_READ)
+            server = _Server(sink, selector, listener, self.token)
             try:
                 while not stop.is_set():
                     server.turn(self._clock)
             finally:
                 server.close()
-
-    def _open(self, host: str, port: int) -> None:
-        self._listener = listen(host, port, socket.SOCK_STREAM, "tcp")
-        self._listener.listen(MAX_CONNECTIONS)
 
 
 class _Connection:
@@ -188,33 +173,3 @@ class _Server:
         self.connections.remove(connection)
         self.gate.leave(connection)
         connection.sock.close()
-
-
-def listen(host: str, port: int, kind: socket.SocketKind, scheme: str) -> socket.socket:
-    """A socket bound to an address.
-
-    Raises:
-        ArgumentError: It cannot be.
-    """
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=kind, flags=socket.AI_PASSIVE)[0]
-        sock = socket.socket(family, kind)
-        if kind == socket.SOCK_STREAM and os.name == "posix":  # a player that is started again at once
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            sock.bind(address)
-        except OSError:
-            sock.close()
-            raise
-        return sock
-    except (OSError, UnicodeError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ArgumentError(
-            f"drive: expected to listen at {scheme}://{host}:{port}, got: {reason}"
-        ) from error
-
-
-def authority(sock: socket.socket) -> str:
-    """`127.0.0.1:9000`"""
-    host, port = sock.getsockname()[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

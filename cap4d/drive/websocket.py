@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 from cap4d.drive.gate import Gate
+from cap4d.drive.listener import MAX_CONNECTIONS, Listener
 from cap4d.drive.pace import Pace, unread
 from cap4d.drive.packet import Cause, Sink
-from cap4d.drive.tcp import FLOODED, GREETING, IDLE, MAX_CONNECTIONS, authority, listen
+from cap4d.drive.tcp import FLOODED, GREETING, IDLE
 from cap4d.drive.wire import MAX_LINE, lines_of, same_token
 
 if TYPE_CHECKING:
@@ -38,8 +39,7 @@ class WebSocketReceiver:
     """A WebSocket server; see `packet.Receiver`.
 
     Args:
-        host: To listen on.
-        port: 0 for any that is free; `address` names it.
+        host, port: See `Listener`.
         token: Asked for in the URL, `?token=...`, or as `Authorization: Bearer ...`; None for none.
     Raises:
         ArgumentError: There is no listening there.
@@ -47,38 +47,26 @@ class WebSocketReceiver:
     """
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        token: str | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, host: str, port: int, *, token: str | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         import websockets  # noqa: F401  its absence is told before anything starts
 
         self.token, self._clock = token, clock
-        self._open(host, port)
-        self._bound = self._listener.getsockname()[:2]
-        self.address = f"ws://{authority(self._listener)}"
+        self._listener = Listener("ws", host, port, socket.SOCK_STREAM)
+        self.address = self._listener.address
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """See `packet.Receiver`."""
-        if self._listener.fileno() < 0:  # a run before this one has closed it
-            self._open(*self._bound)
-        with self._listener:
-            asyncio.run(self._serve(sink, stop))
+        with self._listener as listener:
+            asyncio.run(self._serve(listener, sink, stop))
 
-    def _open(self, host: str, port: int) -> None:
-        self._listener = listen(host, port, socket.SOCK_STREAM, "ws")
-        self._listener.listen(MAX_CONNECTIONS)
-
-    async def _serve(self, sink: Sink, stop: threading.Event) -> None:
+    async def _serve(self, listener: socket.socket, sink: Sink, stop: threading.Event) -> None:
         from websockets.asyncio.server import serve
 
         visitors = _Visitors(sink, self.token, self._clock)
         async with serve(
             visitors.drive,
-            sock=self._listener,
+            sock=listener,
             process_request=visitors.admit,
             create_connection=_counted(visitors),
             compression=None,
