@@ -177,7 +177,7 @@ def test_a_run_that_fails_lets_go_of_the_camera(monkeypatch):
     try:
         with pytest.raises(ZeroDivisionError):
             receiver.run(Got(), stop)
-        assert set(threading.enumerate()) == before and script.closed == 1
+        assert set(threading.enumerate()) <= before and script.closed == 1  # other tests end theirs
     finally:
         stop.set()
 
