@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
 
-import av
 import numpy as np
 
-from cap4d.errors import ArgumentError, DataError
+from cap4d.capture.video import open_video, video_frames
+from cap4d.errors import ArgumentError
 
 WIDTH, HEIGHT, FPS = 640, 480, 30  # what a camera is asked for: MediaPipe looks at 192 px of a face
 SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
@@ -87,7 +87,7 @@ class PlayedVideo:
         wait: Callable[[float], None] = time.sleep,
     ) -> None:
         self._path, self._clock, self._wait = path, clock, wait
-        with _opened(path) as container:
+        with open_video(path) as container:
             self._period = float(1 / (container.streams.video[0].average_rate or FPS))
         self._frames: Iterator[np.ndarray] = iter(())
         self._due: float | None = None
@@ -96,7 +96,7 @@ class PlayedVideo:
         """See `CameraDevice`; None if the file does not decode any more."""
         picture = next(self._frames, None)
         if picture is None:
-            self._frames = _decoded(self._path)
+            self._frames = video_frames(self._path)
             picture = next(self._frames, None)
         now = self._clock()
         self._due = now if self._due is None else max(self._due + self._period, now - 1)
@@ -157,28 +157,6 @@ class Newest:
             self._changed.wait_for(lambda: self._thing is not None, timeout)
             thing, self._thing = self._thing, None
             return thing
-
-
-def _opened(path: Path) -> av.container.InputContainer:
-    try:
-        container = av.open(str(path))
-    except (av.FFmpegError, OSError) as error:
-        raise DataError(path, "video", expected="a readable video", found=error.strerror) from error
-    if not container.streams.video:
-        container.close()
-        raise DataError(path, "video", expected="a video stream", found="none")
-    return container
-
-
-def _decoded(path: Path) -> Iterator[np.ndarray]:
-    """uint8[H, W, 3], upright: a display matrix turns a picture counter-clockwise by `rotation` degrees."""
-    with _opened(path) as container:
-        try:
-            for frame in container.decode(video=0):
-                quarters = round(frame.rotation / 90) % 4
-                yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarters))
-        except av.FFmpegError as error:
-            raise DataError(path, "video", expected="frames that decode", found=error.strerror) from error
 
 
 @contextlib.contextmanager

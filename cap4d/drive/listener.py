@@ -46,9 +46,7 @@ class Listener:
             family, _, _, _, address = socket.getaddrinfo(host, port, type=kind, flags=socket.AI_PASSIVE)[0]
             sock = socket.socket(family, kind)
             try:
-                if (
-                    kind == socket.SOCK_STREAM and os.name == "posix"
-                ):  # for a player started again
+                if kind == socket.SOCK_STREAM and os.name == "posix":  # for a player started again
                     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 sock.bind(address)
                 if kind == socket.SOCK_STREAM:

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import av
 import numpy as np
 
 from cap4d.capture.image import IMAGE_SUFFIXES, composite, read_image
+from cap4d.capture.video import open_video, video_frames
 from cap4d.errors import ArgumentError, DataError
 
 DEFAULT_FPS = 30.0
@@ -38,7 +38,7 @@ class Footage:
 
     def frames(self) -> Iterator[np.ndarray]:
         """uint8[H, W, 3], upright."""
-        return _video_frames(self.source) if self.photos is None else map(_photo, self.photos)
+        return video_frames(self.source) if self.photos is None else map(_photo, self.photos)
 
 
 def open_footage(source: str | Path) -> Footage:
@@ -58,7 +58,7 @@ def open_footage(source: str | Path) -> Footage:
         raise ArgumentError(f"{source}: no such video, image or folder")
     if _is_image(source):
         return Footage(source, (source,), DEFAULT_FPS, 1)
-    with _opened(source) as container:
+    with open_video(source) as container:
         stream = container.streams.video[0]
         return Footage(source, None, float(stream.average_rate or DEFAULT_FPS), stream.frames)
 
@@ -73,25 +73,3 @@ def _photo(path: Path) -> np.ndarray:
         pixels = composite(pixels[..., :-1], pixels[..., -1])
     rgb = np.broadcast_to(pixels, (*pixels.shape[:2], 3)) if pixels.shape[2] == 1 else pixels
     return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-
-
-def _opened(source: Path) -> av.container.InputContainer:
-    try:
-        container = av.open(str(source))
-    except (av.FFmpegError, OSError) as error:
-        raise DataError(source, "video", expected="a readable video", found=error.strerror) from error
-    if not container.streams.video:
-        container.close()
-        raise DataError(source, "video", expected="a video stream", found="none")
-    return container
-
-
-def _video_frames(source: Path) -> Iterator[np.ndarray]:
-    """A display matrix (phones write one) turns the frame counter-clockwise by `rotation` degrees."""
-    with _opened(source) as container:
-        try:
-            for frame in container.decode(video=0):
-                quarters = round(frame.rotation / 90) % 4
-                yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarters))
-        except av.FFmpegError as error:
-            raise DataError(source, "video", expected="frames that decode", found=error.strerror) from error
