@@ -6,7 +6,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check --quiet
-APT_PACKAGES := g++ python3-venv python3-dev libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers libvulkan1 xvfb xauth xdotool chromium
+APT_PACKAGES := g++ python3-venv python3-dev libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers libvulkan1 xvfb xauth
+TEST_APT_PACKAGES := xdotool chromium
 CPP := CMakeLists.txt pyproject.toml $(wildcard src/cpp/*)
 
 # The C++ again with every access and every conversion checked, in an environment of its own that borrows the packages of the first.
@@ -23,7 +24,7 @@ SANITIZED_TESTS := $(wildcard tests/property/test_hard_*.py) $(addprefix tests/,
 demo: $(VENV)/built
 	$(BIN)/cap4d demo --out out
 
-test: $(VENV)/built
+test: $(VENV)/built $(VENV)/test_system
 	$(BIN)/python -m pytest
 
 bench: $(VENV)/built
@@ -32,12 +33,16 @@ bench: $(VENV)/built
 lint: $(VENV)/built
 	$(BIN)/ruff check .
 
-$(VENV)/system:
+# What only the tests drive is left out of the demo's set-up.
+$(VENV)/system: PACKAGES := $(APT_PACKAGES)
+$(VENV)/test_system: PACKAGES := $(TEST_APT_PACKAGES)
+$(VENV)/test_system: | $(VENV)/system
+$(VENV)/system $(VENV)/test_system:
 	@mkdir -p $(VENV)
-	@dpkg -s $(APT_PACKAGES) >/dev/null 2>&1 || \
+	@dpkg -s $(PACKAGES) >/dev/null 2>&1 || \
 	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(APT_PACKAGES); \
-	  else echo "cap4d needs these Debian packages, or your system's equals: $(APT_PACKAGES)"; fi
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(PACKAGES); \
+	  else echo "cap4d needs these Debian packages, or your system's equals: $(PACKAGES)"; fi
 	@touch $@
 
 # torch goes first and pinned: asked for as a range by another package it would become the newest CUDA build.
