@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import onnx
 import torch
-from onnx import numpy_helper
 from torch.nn import functional
 
 from cap4d.bundle.float_unet import first_layer
 from cap4d.bundle.quantized_unet import SMALLEST_SCALE, check_quantized, depth
 from cap4d.bundle.unet_graph import layer_names
+from cap4d.export.unet_onnx import network_weights
 
 LEAK = 0.2
 NORM_EPS = 1e-5
@@ -83,8 +82,7 @@ class _FloatNet:
 
     @classmethod
     def load(cls, onnx_model: bytes) -> _FloatNet:
-        graph = onnx.load_model_from_string(onnx_model).graph
-        values = {i.name: numpy_helper.to_array(i).astype(np.float32) for i in graph.initializer}
+        values = network_weights(onnx_model)
         scale = values["scale"][0, 0]
         size = len(scale)
         rows, columns = (torch.from_numpy(values[name].copy()) for name in ("rows", "columns"))

@@ -40,15 +40,6 @@ def network_weights(model: bytes) -> dict[str, np.ndarray]:
     return {name.removesuffix(HALF): array.astype(np.float32) for name, array in floats.items()}
 
 
-def rewritten(model: bytes) -> bytes:
-    """An exported network, of whatever age, as this version writes it: float32 weights, the same function.
-
-    Raises:
-        ArgumentError: It is not an exported U-Net.
-    """
-    return unet_onnx(network_weights(model))
-
-
 def _serialised(unet: UnetGraph) -> bytes:
     shape = [1, 3, unet.size, unet.size]
     graph = helper.make_graph(

@@ -21,7 +21,7 @@ from cap4d.export import bundle as bundle_module
 from cap4d.export.bundle import export_bundle
 from cap4d.export.deformer import export_deformer, worst_difference
 from cap4d.export.idle import SHUT, blinking, idle_clip, is_film, looped
-from cap4d.export.unet_onnx import network_weights, rewritten, unet_onnx
+from cap4d.export.unet_onnx import network_weights, unet_onnx
 
 
 def trained_looking(deformer, seed=0):
@@ -76,8 +76,8 @@ def test_a_network_from_before_is_rewritten_to_the_same_answers():
     net = trained_looking(Deformer(np.ones((32, 32), bool), width=4))
     offsets = torch.randn(2, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * DEFORM_STD
     data = export_deformer(net)
-    assert rewritten(data) == data
-    half = rewritten(halve_weights(data))
+    assert unet_onnx(network_weights(data)) == data
+    half = unet_onnx(network_weights(halve_weights(data)))
     assert 1e-6 < worst_difference(half, net, offsets) < 1e-2
     scan_onnx(half, source="deform.onnx", size=32)
     with pytest.raises(ArgumentError, match=r"expected the weights of a U-Net, 'model\.model\.3\.weight' is"):
