@@ -25,7 +25,7 @@ __all__ = [
     "open_live",
 ]
 
-# Imported when first asked for: onnxruntime takes 0.2 s, and programs choose NumPy's threads before it loads.
+# Imported when first asked for: programs choose NumPy's threads before it loads.
 LAZY = {
     "Avatar": "cap4d.player.avatar",
     "Camera": "cap4d.camera",
