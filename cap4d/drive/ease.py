@@ -6,7 +6,8 @@ from dataclasses import replace
 from typing import Literal
 
 from cap4d.drive.clip import Frame
-from cap4d.drive.jitter_buffer import Moment, mix
+from cap4d.drive.jitter_buffer import Moment
+from cap4d.drive.sample import mix
 
 HOLD = 0.25  # s that a gap is taken for a hiccup
 EASE = 0.75  # s to the neutral face

@@ -17,7 +17,7 @@ import numpy as np
 from cap4d.drive.clip import Frame
 from cap4d.drive.counts import Counts
 from cap4d.drive.packet import Cause
-from cap4d.drive.sample import TURNS, between
+from cap4d.drive.sample import mix
 from cap4d.drive.transit import Transit
 
 SLEW = 0.1  # of the stream's speed
@@ -243,15 +243,6 @@ class JitterBuffer:
 
     def _refuse(self, cause: Cause) -> None:
         self.counts.reject(cause, received=True)
-
-
-def mix(a: Frame, b: Frame, blend: float) -> Frame:
-    """Linear from `a` (0) to `b` (1); a head pose that only one of them has is taken as it is."""
-    values = {"expr": between(a.expr, b.expr, blend, cut=False)}
-    for name in (*TURNS, "tra"):
-        x, y = getattr(a, name), getattr(b, name)
-        values[name] = between(x, y, blend, cut=name in TURNS) if x is not None and y is not None else y
-    return replace(b, t=a.t + blend * (b.t - a.t), **values)
 
 
 def _between(a: _Entry, b: _Entry, t: float) -> Moment:

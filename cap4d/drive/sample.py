@@ -1,4 +1,4 @@
-"""A clip between its frames."""
+"""Between frames: of a clip, and of any two."""
 
 from __future__ import annotations
 
@@ -25,14 +25,19 @@ def sample(clip: Clip, t: float) -> Frame:
     here, there = index % len(clip), min(index % len(clip) + 1, len(clip) - 1)
     if blend < EPSILON or here == there:
         return replace(clip.frame(index), t=t)
-    values = {}
-    for name in ("expr", "eye_rot", "neck_rot", "jaw_rot", "rot", "tra"):
-        value = getattr(clip, name)
-        values[name] = None if value is None else between(value[here], value[there], blend, cut=name in TURNS)
-    return Frame(t, clip.rig_name, **values)
+    return replace(mix(clip.frame(here), clip.frame(there), blend), t=t)
 
 
-def between(a: np.ndarray, b: np.ndarray, blend: float, *, cut: bool) -> np.ndarray:
+def mix(a: Frame, b: Frame, blend: float) -> Frame:
+    """Linear from `a` (0) to `b` (1); a head pose that only one of them has is taken as it is."""
+    values = {"expr": _between(a.expr, b.expr, blend, cut=False)}
+    for name in (*TURNS, "tra"):
+        x, y = getattr(a, name), getattr(b, name)
+        values[name] = _between(x, y, blend, cut=name in TURNS) if x is not None and y is not None else y
+    return replace(b, t=a.t + blend * (b.t - a.t), **values)
+
+
+def _between(a: np.ndarray, b: np.ndarray, blend: float, *, cut: bool) -> np.ndarray:
     """Linear from `a` to `b`; with `cut`, a jump of more than `MAX_TURN` stays one."""
     if cut and np.linalg.norm(b - a) > MAX_TURN:
         return a if blend < 0.5 else b

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from cap4d.drive.clip import Frame
 from cap4d.drive.counts import Counts
-from cap4d.drive.jitter_buffer import MAX_FRAMES, SLEW, JitterBuffer, mix
+from cap4d.drive.jitter_buffer import MAX_FRAMES, SLEW, JitterBuffer
 from cap4d.drive.packet import Cause
+from cap4d.drive.sample import mix
 
 ZEROS = np.zeros(3, np.float32)
 EPOCH = 5000.0  # s, what the display's clock shows when the stream begins
