@@ -139,7 +139,7 @@ class Studio:
         """Those who have not shown what they were sent for too long."""
         now = self.clock()
         with self._changed:
-            return [watcher for watcher in self._watchers if watcher.pace.stalled(now)]
+            return [watcher for watcher in self._watchers if watcher.flow.stalled(now)]
 
     def introduction(self) -> dict[str, Any]:
         """What a page is told first."""
@@ -175,7 +175,7 @@ class Studio:
         return {"pictures": len(latencies), "latency_ms": found}
 
     def _acknowledge(self, watcher: Watcher, number: int, now: float) -> None:
-        latency = watcher.pace.acknowledged(number, now)
+        latency = watcher.flow.acknowledged(number, now)
         if latency is not None:
             self.latencies.append(latency)
 
@@ -260,7 +260,7 @@ def picture_message(head: dict[str, Any], jpeg: bytes, watcher: Watcher, shot: S
     The head: `n` the picture's number, to be echoed when it is shown; `at` s in the clip; `stream` a live
     stream's state; `drawn` ms; `latency` ms, median of late; `size`; `quantiser`.
     """
-    latency = watcher.pace.latency
+    latency = watcher.flow.latency
     mine = {
         "n": watcher.pictures,
         "latency": None if latency is None else round(latency * 1e3, 1),

@@ -376,7 +376,7 @@ def test_who_connects_and_says_nothing_is_dropped(served, monkeypatch):
 
 
 def test_who_does_not_show_what_is_sent_is_dropped(served, monkeypatch):
-    monkeypatch.setattr("cap4d.app.serve.pace.STALLED", 0.3)
+    monkeypatch.setattr("cap4d.app.serve.flow.STALLED", 0.3)
     with watching(served) as client, pytest.raises(ConnectionClosed):
         while True:
             client.picture(echo=False)
