@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cap4d.app.loading import open_playback
 from cap4d.app.options import Options
-from cap4d.app.serve.gate import Gate, parse_address
+from cap4d.app.serve.door import Door, parse_address
 from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.server import PageServer
 from cap4d.app.serve.studio import Studio
@@ -38,7 +38,7 @@ def play_page(path: Path, options: Options) -> None:
 
     check_options(options)
     host, port = parse_address(options.serve)
-    gate = Gate(host, options.token)
+    door = Door(host, options.token)
     if options.stats is not None:
         check_file(options.stats, "stats")
     avatar = Avatar.load(path, deformer=options.deformer)
@@ -61,7 +61,7 @@ def play_page(path: Path, options: Options) -> None:
         )
         studio.start()
         stack.callback(_finish, studio, options)
-        serve_studio(studio, gate, port, title=path.stem)
+        serve_studio(studio, door, port, title=path.stem)
 
 
 def _finish(studio: Studio, options: Options) -> None:
@@ -70,13 +70,13 @@ def _finish(studio: Studio, options: Options) -> None:
         write_stats(options.stats, page_statistics(studio, options.size or SIZE))
 
 
-def serve_studio(studio: Studio, gate: Gate, port: int, *, title: str) -> None:
+def serve_studio(studio: Studio, door: Door, port: int, *, title: str) -> None:
     """Serves until interrupted, or the studio breaks."""
-    server = PageServer(studio, gate, title=title)
+    server = PageServer(studio, door, title=title)
 
     def ready(port: int) -> None:
-        log.info("%s", gate.address(port))
-        if not gate.loopback:
+        log.info("%s", door.address(port))
+        if not door.loopback:
             log.info("anybody who has this address can watch; the line is not encrypted. Ctrl-C ends it")
 
     async def run() -> None:

@@ -27,7 +27,7 @@ pytest.importorskip("onnx")
 from cap4d.app.main import main
 from cap4d.app.playback import ClipPlayback
 from cap4d.app.serve import server as server_module
-from cap4d.app.serve.gate import Gate
+from cap4d.app.serve.door import Door
 from cap4d.app.serve.jpeg import JpegEncoder
 from cap4d.app.serve.message import parse_message
 from cap4d.app.serve.performance import Performance
@@ -63,9 +63,9 @@ class Served:
         port: Where; `studio`, `server`: what.
     """
 
-    def __init__(self, gate: Gate, *, limit: int = 4) -> None:
+    def __init__(self, door: Door, *, limit: int = 4) -> None:
         self.studio = tiny_studio(limit=limit)
-        self.gate, self.server = gate, PageServer(self.studio, gate, title="tiny")
+        self.door, self.server = door, PageServer(self.studio, door, title="tiny")
         self.port = 0
 
     def url(self, path: str = "/socket", token: str | None = None) -> str:
@@ -84,9 +84,9 @@ class Served:
 
 
 @contextlib.contextmanager
-def serving(gate: Gate | None = None, **options) -> Iterator[Served]:
+def serving(door: Door | None = None, **options) -> Iterator[Served]:
     """Serves on a free port until the block ends."""
-    served = Served(Gate("127.0.0.1") if gate is None else gate, **options)
+    served = Served(Door("127.0.0.1") if door is None else door, **options)
     served.studio.start()
     listens, loops = threading.Event(), []
     over = asyncio.Event()
@@ -186,7 +186,7 @@ def test_the_page_and_its_files_are_served_with_headers_that_lock_it_down(served
 
 
 @pytest.mark.parametrize(
-    "path", ["/../gate.py", "/page.html", "/server.py", "/etc/passwd", "/%2e%2e/gate.py"]
+    "path", ["/../door.py", "/page.html", "/server.py", "/etc/passwd", "/%2e%2e/door.py"]
 )
 def test_nothing_else_is_there(served, path):
     assert served.get(path)[0] == 404
@@ -214,7 +214,7 @@ def test_another_site_may_not_connect(served):
 
 
 def test_where_others_can_reach_it_the_token_goes_before_everything():
-    with serving(Gate("0.0.0.0", "secret")) as served:
+    with serving(Door("0.0.0.0", "secret")) as served:
         assert served.get("/")[0] == served.get("/?token=wrong")[0] == 403
         assert b"token" in served.get("/")[2]
         for token in (None, "", "wrong"):
