@@ -19,7 +19,6 @@ from cap4d.app.overlays.overlays import Overlays
 from cap4d.app.recent import RecentFiles, config_folder
 from cap4d.app.renderers import CpuRenderer, GlRenderer, Renderer
 from cap4d.app.shortcuts import Action
-from cap4d.app.sound import Sound
 from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
 from cap4d.app.window import Window
@@ -27,6 +26,7 @@ from cap4d.app.window import Window
 from cap4d.camera import Camera
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import statistics, write_stats
+from cap4d.player.sound import Sound
 from cap4d.player.video import check_file
 
 log = logging.getLogger(__name__)

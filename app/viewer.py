@@ -25,7 +25,7 @@ from cap4d.app.playback import SPEEDS, ClipPlayback, Playback, StreamPlayback
 from cap4d.app.quality import Quality
 from cap4d.app.recent import RecentFiles
 from cap4d.app.shortcuts import Action
-from cap4d.app.sound import Sound, SoundPlayer
+from cap4d.app.sound import SoundPlayer
 from cap4d.app.timings import Timings
 from cap4d.app.toasts import Toasts
 
@@ -34,6 +34,7 @@ from cap4d.drive.clip import Frame
 from cap4d.errors import Cap4dError
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import STANDING, camera_path, fitted, with_live_head
+from cap4d.player.sound import Sound
 
 Clock = Callable[[], float]
 
