@@ -13,8 +13,6 @@ from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.player.avatar import Avatar
 
-Overlay = Backdrop  # its older name
-
 
 class Renderer(Protocol):
     """Draws one avatar."""
@@ -42,7 +40,7 @@ class GlRenderer:
     def __init__(self, ctx: moderngl.Context, avatar: Avatar) -> None:
         self.ctx, self.avatar = ctx, avatar
         self.splats = SplatPass(ctx, bound_gaussians(avatar))
-        self.overlay = Backdrop(ctx)
+        self.backdrop = Backdrop(ctx)
         self.target: moderngl.Framebuffer | None = None
         self.vertices = np.zeros((0, 3), np.float32)
 
@@ -65,7 +63,7 @@ class GlRenderer:
             if self.target is None or self.target.size != picture.size:
                 self.target = self.ctx.simple_framebuffer(picture.size)
             self.target.use()
-            self.overlay.draw(picture, background)
+            self.backdrop.draw(picture, background)
             flat = np.frombuffer(self.target.read(components=4), np.uint8)
         return flat.reshape(camera.height, camera.width, 4)
 
