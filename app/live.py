@@ -32,7 +32,7 @@ from cap4d.player.video import check_file
 log = logging.getLogger(__name__)
 
 IDLE_SECONDS = 0.25  # the longest sleep of a window that shows nothing new
-BLINK_SECONDS = 0.1  # between pictures while a text field is open, whose cursor blinks
+BUSY_SECONDS = 0.02  # the longest while something is done in the background
 LEFT_OVER = (0.095, 0.100, 0.113)  # behind the panels
 
 
@@ -305,8 +305,8 @@ class LivePlayer:
         viewer, now = self.viewer, self.viewer.now
         due = float("inf") if viewer.is_settling else viewer.playback.due() - now
         toasts = viewer.toasts.next_change(now) - now
-        busy = BLINK_SECONDS / 5 if viewer.jobs.label is not None else IDLE_SECONDS
-        return min(due, toasts, busy)
+        longest = BUSY_SECONDS if viewer.jobs.label is not None else IDLE_SECONDS
+        return min(due, toasts, longest)
 
     def _toggle_recording(self) -> None:
         *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
