@@ -181,12 +181,16 @@ class LivePlayer:
         self.input.picture_size = layout.picture.width, layout.picture.height
         return layout
 
+    def _place(self, layout: Layout) -> tuple[int, int, int, int]:
+        """(left, bottom, width, height) px of the picture in the window."""
+        return layout.picture.in_pixels(self.window.size, self.window.framebuffer_size)
+
     def _picture_size(self, layout: Layout) -> tuple[int, int]:
         """The CPU draws the window's own units, however many pixels a display has to each, or fewer."""
         if self.renderer.name == "cpu":
             scale = self.viewer.quality.scale
             return max(round(layout.picture.width * scale), 1), max(round(layout.picture.height * scale), 1)
-        *_, width, height = layout.picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        *_, width, height = self._place(layout)
         return max(width, 1), max(height, 1)
 
     def _draw_picture(self, layout: Layout) -> bool:
@@ -233,8 +237,7 @@ class LivePlayer:
 
     def _show(self, layout: Layout, is_new: bool) -> None:
         """Lays the picture and the panels out in the window."""
-        window, viewer = self.window, self.viewer
-        place = layout.picture.in_pixels(window.size, window.framebuffer_size)
+        window, viewer, place = self.window, self.viewer, self._place(layout)
         canvas = self._draw_canvas(place[2:], is_new) if self.picture is not None else None
         pixels = window.use()
         window.ctx.clear(*LEFT_OVER)
@@ -265,7 +268,7 @@ class LivePlayer:
         self.canvas.draw(self.picture, background, size, **drawn_by)
 
     def _take_screenshot(self) -> None:
-        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        *_, width, height = self._place(self._layout())
         if self.picture is None or min(width, height) < 1:
             return
         background = self.taking.behind(self.viewer.background)
@@ -309,7 +312,7 @@ class LivePlayer:
         return min(due, toasts, longest)
 
     def _toggle_recording(self) -> None:
-        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        *_, width, height = self._place(self._layout())
         self.taking.toggle_recording((width, height))
         self.gui.touch()
 
