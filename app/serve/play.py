@@ -24,7 +24,6 @@ from cap4d.player.video import check_file
 log = logging.getLogger(__name__)
 
 MAX_WATCHERS = 4
-SIZE = 512, 512  # px of the largest picture, unless told otherwise
 
 
 def play_page(path: Path, options: Options) -> None:
@@ -56,7 +55,7 @@ def play_page(path: Path, options: Options) -> None:
             Performance(playback, avatar.bundle),
             cameras,
             backend=options.backend,
-            area=math.prod(options.size or SIZE),
+            area=math.prod(options.picture_size),
             limit=MAX_WATCHERS,
         )
         studio.start()
@@ -67,7 +66,7 @@ def play_page(path: Path, options: Options) -> None:
 def _finish(studio: Studio, options: Options) -> None:
     studio.stop()
     if options.stats is not None:
-        write_stats(options.stats, page_statistics(studio, options.size or SIZE))
+        write_stats(options.stats, page_statistics(studio, options.picture_size))
 
 
 def serve_studio(studio: Studio, door: Door, port: int, *, title: str) -> None:
