@@ -7,9 +7,9 @@ import math
 from pathlib import Path
 
 import numpy as np
-from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
 from cap4d.app.options import Options
 from cap4d.app.real_time import record_live
+from cap4d.app.renderers import open_gl
 
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
@@ -67,26 +67,12 @@ def _play_live_source(path: Path, avatar: Avatar, options: Options) -> None:
 def choose_backend(wanted: str, avatar: Avatar) -> tuple[str, Draw]:
     """The backend's name and its call.
 
-    Args:
-        wanted: `cpu`, `gl`, or `auto`: OpenGL where a GPU is behind it, since a software driver takes several
-            times as long as the CPU renderer.
     Raises:
-        GlUnavailableError: `gl` is wanted and not there.
+        GlUnavailableError: See `open_gl`.
     """
-    if wanted == "cpu":
+    renderer = open_gl(wanted, avatar)
+    if renderer is None:
         return "cpu", draw_on_cpu
-    try:
-        ctx = headless_context()
-    except GlUnavailableError:
-        if wanted == "gl":
-            raise
-        return "cpu", draw_on_cpu
-    if wanted == "auto" and is_software(ctx):
-        ctx.release()
-        return "cpu", draw_on_cpu
-    from cap4d.app.renderers import GlRenderer
-
-    renderer = GlRenderer(ctx, avatar)
 
     def draw_on_gpu(_: Avatar, frame: Frame, camera: Camera) -> np.ndarray:
         return renderer.draw(frame, camera)

@@ -7,6 +7,7 @@ from typing import Protocol
 import moderngl
 import numpy as np
 from cap4d.app.background import WHITE, Backdrop, Color
+from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
 from cap4d.app.splat_pass import BoundGaussians, SplatPass
 
 from cap4d.camera import Camera
@@ -94,6 +95,29 @@ class CpuRenderer:
             self.picture.repeat_x = self.picture.repeat_y = False
         self.picture.write(image)
         return self.picture
+
+
+def open_gl(wanted: str, avatar: Avatar) -> GlRenderer | None:
+    """OpenGL without a window, its context this thread's; None: the CPU is to draw.
+
+    Args:
+        wanted: `cpu`, `gl`, or `auto`: OpenGL where a GPU is behind it, since a software driver takes several
+            times as long as the CPU renderer.
+    Raises:
+        GlUnavailableError: `gl` is wanted and not there.
+    """
+    if wanted == "cpu":
+        return None
+    try:
+        ctx = headless_context()
+    except GlUnavailableError:
+        if wanted == "gl":
+            raise
+        return None
+    if wanted == "auto" and is_software(ctx):
+        ctx.release()
+        return None
+    return GlRenderer(ctx, avatar)
 
 
 def bound_gaussians(avatar: Avatar) -> BoundGaussians:
