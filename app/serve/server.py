@@ -49,7 +49,6 @@ class PageServer:
 
     def __init__(self, studio: Studio, door: Door, *, title: str) -> None:
         self.studio, self.door, self.title = studio, door, title
-        self.refused = 0  # requests and watchers
         self._sockets: dict[Watcher, object] = {}
         self._connections = 0
         self._files = read_files()
@@ -94,7 +93,6 @@ class PageServer:
         if refusal is None and path in (PAGE, SOCKET) and self.studio.is_full:
             refusal = Refusal(503, FULL.format(self.studio.limit))
         if refusal is not None:
-            self.refused += 1
             return self._respond(refusal.status, "text/html", self._refusal_page(refusal))
         if path == SOCKET:
             return None
@@ -155,7 +153,6 @@ class PageServer:
 
         watcher = self.studio.admit(deliver)
         if watcher is None:
-            self.refused += 1
             await socket.close(TRY_AGAIN, "full")
             return
         self._sockets[watcher] = socket
@@ -179,7 +176,6 @@ class PageServer:
                     raise BadMessageError("expected fewer messages")
                 message = parse_message(data)
             except BadMessageError as error:
-                self.refused += 1
                 await socket.close(POLICY, str(error))
                 return
             if self.studio.hear(watcher, message):
