@@ -6,12 +6,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cap4d.app.background import WHITE, Color
 from cap4d.app.orbit import Orbit
 from cap4d.app.serve.flow import LEVELS, Flow, Level
 from cap4d.app.serve.message import Message
 
-Color = tuple[float, float, float]
-WHITE: Color = (1.0, 1.0, 1.0)
 MIN_SIDE = 16  # px
 SHARPEN_SECONDS = 0.3  # after which a picture that stands still is sent at its best
 
@@ -45,7 +44,7 @@ class Watcher:
         self.deliver, self.area = deliver, area
         self.orbit: Orbit | None = None
         self.size = (math.isqrt(area),) * 2
-        self.background = WHITE
+        self.background: Color = WHITE
         self.flow = Flow()
         self.pictures = 0  # sent so far
         self._shown: tuple[object, Shot] | None = None  # (moment, shot) of the last picture
