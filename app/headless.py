@@ -7,14 +7,14 @@ import math
 from pathlib import Path
 
 import numpy as np
+from cap4d.app.loading import open_stream
 from cap4d.app.options import Options
 from cap4d.app.real_time import record_live
 from cap4d.app.renderers import open_gl
 
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
-from cap4d.drive.fillers import Fillers
-from cap4d.drive.open_live import is_live, open_live
+from cap4d.drive.open_live import is_live
 from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
@@ -50,9 +50,9 @@ def _play_live_source(path: Path, avatar: Avatar, options: Options) -> None:
     if options.pipeline:
         raise ArgumentError(f"pipeline: expected a file to play, got {options.drive}, which comes live")
     backend, draw = choose_backend(options.backend, avatar)
-    out, fillers = options.out or f"{path.stem}.mp4", Fillers(avatar.bundle, **options.fill)
-    settings = dict(template=options.template, sender=options.sender, fillers=fillers)
-    with open_live(options.drive, avatar.bundle, **settings) as stream:
+    out = options.out or f"{path.stem}.mp4"
+    driving = options.driving | {"fps": None}  # --fps is the file's
+    with open_stream(options.drive, avatar.bundle, **driving) as stream:
         stats = record_live(avatar, stream, options, out, draw=draw, backend=backend)
     drive = stats["drive"]
     log.info(
