@@ -27,7 +27,6 @@ from cap4d.camera import Camera
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import statistics, write_stats
 from cap4d.player.sound import Sound
-from cap4d.player.video import check_file
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +41,6 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     Raises:
         ArgumentError, DataError: The avatar or what drives it is not sound.
     """
-    if options.stats is not None:
-        check_file(options.stats, "stats")
     viewer = open_viewer(path, options)
     player = LivePlayer(window, viewer, options.backend)
     try:

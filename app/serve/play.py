@@ -19,7 +19,6 @@ from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import camera_path, live_camera_path
 from cap4d.player.offline import head_centre, statistics, write_stats
-from cap4d.player.video import check_file
 
 log = logging.getLogger(__name__)
 
@@ -38,8 +37,6 @@ def play_page(path: Path, options: Options) -> None:
     check_options(options)
     host, port = parse_address(options.serve)
     door = Door(host, options.token)
-    if options.stats is not None:
-        check_file(options.stats, "stats")
     avatar = Avatar.load(path, deformer=options.deformer)
     with ExitStack() as stack:
         playback = open_playback(options.drive, avatar.bundle, **options.driving)
