@@ -17,7 +17,7 @@ from cap4d.app.serve.studio import Studio
 
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
-from cap4d.player.camera_path import camera_path, live_camera_path
+from cap4d.player.camera_path import STANDING, camera_path
 from cap4d.player.offline import head_centre, statistics, write_stats
 
 log = logging.getLogger(__name__)
@@ -45,12 +45,12 @@ def play_page(path: Path, options: Options) -> None:
         if playback.is_live:
             log.info("listening for frames on %s", playback.name)
         fps, centre = 1 / playback.interval, head_centre(avatar)
-        choose = live_camera_path if playback.is_live else camera_path
-        cameras = choose(options.camera, avatar.camera, centre, fps=fps, size=None)
+        cameras = camera_path(options.camera, avatar.camera, centre, fps=fps, size=None)
         studio = Studio(
             avatar,
             Performance(playback, avatar.bundle),
             cameras,
+            turns_head=playback.is_live and options.camera in STANDING,
             backend=options.backend,
             area=math.prod(options.picture_size),
             limit=MAX_WATCHERS,

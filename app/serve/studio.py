@@ -41,6 +41,7 @@ class Studio:
         avatar: Drawn by the studio's own thread alone, from `start` on.
         performance: What it does.
         cameras: Where it is seen from until somebody takes the camera.
+        turns_head: A live source turns the head; the cameras know nothing of it.
         backend: `auto`, `gl` or `cpu`.
         area: px that a picture may have.
         limit: Watchers at once.
@@ -53,12 +54,14 @@ class Studio:
         performance: Performance,
         cameras: CameraPath,
         *,
+        turns_head: bool = False,
         backend: str = "auto",
         area: int = 512 * 512,
         limit: int = 4,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.avatar, self.performance, self.cameras = avatar, performance, cameras
+        self.turns_head = turns_head
         self.backend, self.area, self.limit, self.clock = backend, area, limit, clock
         self.centre = head_centre(avatar)
         self.moments = 0  # drawn
@@ -242,8 +245,9 @@ class Studio:
     def _camera(self, shot: Shot, frame: Frame, moment: Moment) -> Camera:
         if shot.orbit is not None:
             camera = shot.orbit.camera(*shot.size)
-            return with_live_head(camera, frame) if self.performance.is_live else camera
-        return fitted(self.cameras(moment[0], frame), shot.size)
+        else:
+            camera = fitted(self.cameras(moment[0], frame), shot.size)
+        return with_live_head(camera, frame) if self.turns_head else camera
 
     def _nap(self, now: float) -> float:
         """s until something may be due by itself; whoever comes or says something ends it."""

@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from cap4d.app.playback import ClipPlayback
 from cap4d.app.serve import server as server_module
 from cap4d.app.serve.door import Door
 from cap4d.app.serve.jpeg import JpegEncoder
-from cap4d.app.serve.message import parse_message
+from cap4d.app.serve.message import Message, parse_message
 from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.server import PageServer
 from cap4d.app.serve.studio import Studio
@@ -47,13 +48,13 @@ from cap4d.player.camera_path import camera_path
 PATIENCE = 20.0  # s that anything may take on a busy machine
 
 
-def tiny_studio(*, limit: int = 4, clock: Callable[[], float] = time.monotonic) -> Studio:
+def tiny_studio(*, clock: Callable[[], float] = time.monotonic, **settings) -> Studio:
     """Not started."""
     bundle = tiny_bundle(network=False)
     performance = Performance(ClipPlayback(bundle.idle, clock()), bundle)
     cameras = camera_path("static", bundle.camera, np.zeros(3), fps=24, size=None)
     avatar = Avatar(bundle, deformer="off", threads=1)
-    return Studio(avatar, performance, cameras, backend="cpu", area=128 * 128, limit=limit, clock=clock)
+    return Studio(avatar, performance, cameras, backend="cpu", area=128 * 128, clock=clock, **settings)
 
 
 class Served:
@@ -295,6 +296,17 @@ def test_what_one_does_to_the_face_all_see(served):
         one.say(reset=True, expr={"jawOpen": None})
         while other.told[-1]["state"]["held"]:
             other.picture()
+
+
+def test_a_live_head_is_turned_once_whoever_has_the_camera():
+    studio = tiny_studio(turns_head=True)
+    frame = studio._seen = replace(studio.performance.frame(), rot=np.float32([0, 0.5, 0]))
+    watcher = studio.admit(lambda _: None)
+    before = studio._camera(watcher.shot((0, 0), 0.0), frame, (0, 0))
+    assert not np.allclose(before.viewmat, studio.avatar.camera.viewmat, atol=0.1)
+    watcher.look(Message(zoom=0.0), studio._view)
+    taken_over = studio._camera(watcher.shot((0, 0), 0.0), frame, (0, 0))
+    assert np.allclose(taken_over.viewmat, before.viewmat, atol=1e-6)
 
 
 class CountingPainter:
