@@ -48,15 +48,14 @@ class Controls:
         if self._drag is Drag.TURN:
             self.orbit = self._seen().turned(dx / max(size[1], 1), dy / max(size[1], 1))
         elif self._drag is Drag.PAN:
-            side = max(min(size), 1)
-            self.orbit = self._seen().panned(dx / side, dy / side)
+            self.pan(dx, dy, size)
 
     def scroll(self, steps: float) -> None:
         """The wheel turned away from the user by `steps`; a trackpad sends parts of them."""
         self.orbit = self._seen().zoomed(min(max(steps, -MAX_SCROLL), MAX_SCROLL))
 
     def pan(self, right: float, down: float, size: tuple[int, int]) -> None:
-        """Two fingers moved the picture, window units."""
+        """The picture is moved, window units."""
         side = max(min(size), 1)
         self.orbit = self._seen().panned(right / side, down / side)
 

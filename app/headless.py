@@ -7,14 +7,14 @@ import math
 from pathlib import Path
 
 import numpy as np
-from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
+from cap4d.app.loading import open_stream
 from cap4d.app.options import Options
 from cap4d.app.real_time import record_live
+from cap4d.app.renderers import open_gl
 
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
-from cap4d.drive.fillers import Fillers
-from cap4d.drive.open_live import is_live, open_live
+from cap4d.drive.open_live import is_live
 from cap4d.drive.source import open_source
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
@@ -50,9 +50,9 @@ def _play_live_source(path: Path, avatar: Avatar, options: Options) -> None:
     if options.pipeline:
         raise ArgumentError(f"pipeline: expected a file to play, got {options.drive}, which comes live")
     backend, draw = choose_backend(options.backend, avatar)
-    out, fillers = options.out or f"{path.stem}.mp4", Fillers(avatar.bundle, **options.fill)
-    settings = dict(template=options.template, sender=options.sender, fillers=fillers)
-    with open_live(options.drive, avatar.bundle, **settings) as stream:
+    out = options.out or f"{path.stem}.mp4"
+    driving = options.driving | {"fps": None}  # --fps is the file's
+    with open_stream(options.drive, avatar.bundle, **driving) as stream:
         stats = record_live(avatar, stream, options, out, draw=draw, backend=backend)
     drive = stats["drive"]
     log.info(
@@ -67,26 +67,12 @@ def _play_live_source(path: Path, avatar: Avatar, options: Options) -> None:
 def choose_backend(wanted: str, avatar: Avatar) -> tuple[str, Draw]:
     """The backend's name and its call.
 
-    Args:
-        wanted: `cpu`, `gl`, or `auto`: OpenGL where a GPU is behind it, since a software driver takes several
-            times as long as the CPU renderer.
     Raises:
-        GlUnavailableError: `gl` is wanted and not there.
+        GlUnavailableError: See `open_gl`.
     """
-    if wanted == "cpu":
+    renderer = open_gl(wanted, avatar)
+    if renderer is None:
         return "cpu", draw_on_cpu
-    try:
-        ctx = headless_context()
-    except GlUnavailableError:
-        if wanted == "gl":
-            raise
-        return "cpu", draw_on_cpu
-    if wanted == "auto" and is_software(ctx):
-        ctx.release()
-        return "cpu", draw_on_cpu
-    from cap4d.app.renderers import GlRenderer
-
-    renderer = GlRenderer(ctx, avatar)
 
     def draw_on_gpu(_: Avatar, frame: Frame, camera: Camera) -> np.ndarray:
         return renderer.draw(frame, camera)

@@ -19,7 +19,6 @@ from cap4d.app.overlays.overlays import Overlays
 from cap4d.app.recent import RecentFiles, config_folder
 from cap4d.app.renderers import CpuRenderer, GlRenderer, Renderer
 from cap4d.app.shortcuts import Action
-from cap4d.app.sound import Sound
 from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
 from cap4d.app.window import Window
@@ -27,12 +26,12 @@ from cap4d.app.window import Window
 from cap4d.camera import Camera
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import statistics, write_stats
-from cap4d.player.video import check_file
+from cap4d.player.sound import Sound
 
 log = logging.getLogger(__name__)
 
 IDLE_SECONDS = 0.25  # the longest sleep of a window that shows nothing new
-BLINK_SECONDS = 0.1  # between pictures while a text field is open, whose cursor blinks
+BUSY_SECONDS = 0.02  # the longest while something is done in the background
 LEFT_OVER = (0.095, 0.100, 0.113)  # behind the panels
 
 
@@ -42,8 +41,6 @@ def play_live(path: Path, options: Options, window: Window) -> None:
     Raises:
         ArgumentError, DataError: The avatar or what drives it is not sound.
     """
-    if options.stats is not None:
-        check_file(options.stats, "stats")
     viewer = open_viewer(path, options)
     player = LivePlayer(window, viewer, options.backend)
     try:
@@ -181,12 +178,16 @@ class LivePlayer:
         self.input.picture_size = layout.picture.width, layout.picture.height
         return layout
 
+    def _place(self, layout: Layout) -> tuple[int, int, int, int]:
+        """(left, bottom, width, height) px of the picture in the window."""
+        return layout.picture.in_pixels(self.window.size, self.window.framebuffer_size)
+
     def _picture_size(self, layout: Layout) -> tuple[int, int]:
         """The CPU draws the window's own units, however many pixels a display has to each, or fewer."""
         if self.renderer.name == "cpu":
             scale = self.viewer.quality.scale
             return max(round(layout.picture.width * scale), 1), max(round(layout.picture.height * scale), 1)
-        *_, width, height = layout.picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        *_, width, height = self._place(layout)
         return max(width, 1), max(height, 1)
 
     def _draw_picture(self, layout: Layout) -> bool:
@@ -233,8 +234,7 @@ class LivePlayer:
 
     def _show(self, layout: Layout, is_new: bool) -> None:
         """Lays the picture and the panels out in the window."""
-        window, viewer = self.window, self.viewer
-        place = layout.picture.in_pixels(window.size, window.framebuffer_size)
+        window, viewer, place = self.window, self.viewer, self._place(layout)
         canvas = self._draw_canvas(place[2:], is_new) if self.picture is not None else None
         pixels = window.use()
         window.ctx.clear(*LEFT_OVER)
@@ -265,7 +265,7 @@ class LivePlayer:
         self.canvas.draw(self.picture, background, size, **drawn_by)
 
     def _take_screenshot(self) -> None:
-        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        *_, width, height = self._place(self._layout())
         if self.picture is None or min(width, height) < 1:
             return
         background = self.taking.behind(self.viewer.background)
@@ -305,11 +305,11 @@ class LivePlayer:
         viewer, now = self.viewer, self.viewer.now
         due = float("inf") if viewer.is_settling else viewer.playback.due() - now
         toasts = viewer.toasts.next_change(now) - now
-        busy = BLINK_SECONDS / 5 if viewer.jobs.label is not None else IDLE_SECONDS
-        return min(due, toasts, busy)
+        longest = BUSY_SECONDS if viewer.jobs.label is not None else IDLE_SECONDS
+        return min(due, toasts, longest)
 
     def _toggle_recording(self) -> None:
-        *_, width, height = self._layout().picture.in_pixels(self.window.size, self.window.framebuffer_size)
+        *_, width, height = self._place(self._layout())
         self.taking.toggle_recording((width, height))
         self.gui.touch()
 

@@ -14,6 +14,7 @@ from cap4d.app.playback import ClipPlayback, Playback, StreamPlayback
 from cap4d.bundle.bundle import Bundle
 from cap4d.bundle.reader import read_bundle
 from cap4d.drive.fillers import Fillers
+from cap4d.drive.live import LiveStream
 from cap4d.drive.open_live import is_live, open_live
 from cap4d.drive.source import open_source
 from cap4d.player.avatar import Avatar
@@ -94,9 +95,26 @@ def open_playback(
         ArgumentError, DataError: See `open_source` and `open_live`.
     """
     if is_live(spec):
-        settings = dict(template=template, fps=fps, sender=sender, fillers=Fillers(bundle, **fill))
-        stream = open_live(spec, bundle, **settings)
+        stream = open_stream(spec, bundle, template=template, fps=fps, sender=sender, fill=fill)
         return StreamPlayback(stream, rig_name=bundle.rig_name)
     clip = open_source(spec, bundle, template=template, fps=fps)
     name = "idle clip" if spec is None else Path(spec).name
     return ClipPlayback(clip, time.monotonic(), name=name)
+
+
+def open_stream(
+    spec: str,
+    bundle: Bundle,
+    *,
+    template: Path | None = None,
+    fps: float | None = None,
+    sender: Path | None = None,
+    fill: Mapping[str, bool] = ALL,
+) -> LiveStream:
+    """The live source of `open_playback` by itself; it starts as a context manager.
+
+    Raises:
+        ArgumentError, DataError: See `open_live`.
+    """
+    fillers = Fillers(bundle, **fill)
+    return open_live(spec, bundle, template=template, fps=fps, sender=sender, fillers=fillers)

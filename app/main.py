@@ -30,12 +30,16 @@ def play(options: Options) -> None:
     """Opens the window, or renders offline when there is to be none or can be none.
 
     Raises:
+        ArgumentError: What is asked for cannot be.
         DataError: There is no avatar, or it is not sound.
     """
     from cap4d.bundle.reader import read_manifest
+    from cap4d.player.video import check_file
 
     avatar = options.avatar if options.avatar is not None else demo_avatar()
     read_manifest(avatar)  # before a window opens for what is no avatar
+    if options.stats is not None:
+        check_file(options.stats, "stats")
     if options.serve is not None:
         from cap4d.app.serve.play import play_page
 

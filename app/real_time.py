@@ -17,7 +17,7 @@ from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import CameraPath, live_camera_path
 from cap4d.player.offline import Draw, head_centre, statistics, write_stats
 from cap4d.player.sound import Sound
-from cap4d.player.video import VideoWriter, check_file, check_output
+from cap4d.player.video import VideoWriter, check_output
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +37,6 @@ def record_live(
         ArgumentError: What is asked for cannot be written, or the source could not be opened.
     """
     fps = options.fps or DEFAULT_FPS
-    if options.stats is not None:
-        check_file(options.stats, "stats")
     size = options.picture_size
     cameras = live_camera_path(options.camera, avatar.camera, head_centre(avatar), fps=fps, size=size)
     several = options.frames or 2

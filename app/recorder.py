@@ -56,13 +56,12 @@ class Recorder:
         path: `*.mp4`; replaced when it exists.
         size: (width, height) px of the video. Pictures of another size are fitted in, on black.
         fps: Of the video.
-        audio: Its sound, or the .wav of it.
+        sound: Its sound, or None.
         sound_at: Where the sound is as a picture is added, for sound that is paused, sought or repeated.
             None: it starts with the first picture and goes on.
         start: Whether to start the thread (tests do not).
     Raises:
         ArgumentError: No such file can be written, or the size or rate is out of range.
-        DataError: The .wav is not sound.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class Recorder:
         path: str | Path,
         size: tuple[int, int],
         fps: float,
-        audio: Sound | str | Path | None = None,
+        sound: Sound | None = None,
         *,
         sound_at: SoundAt | None = None,
         start: bool = True,
@@ -83,7 +82,7 @@ class Recorder:
         if not 1 <= fps <= 1000:
             raise ArgumentError(f"recording: expected 1 to 1000 frames per second, got {fps:g}")
         check_output(self.path, fps=fps, size=size)
-        self.sound = audio if isinstance(audio, Sound) or audio is None else Sound.load(audio)
+        self.sound = sound
         self.frames = 0  # of the video so far
         self.repeated = 0  # pictures that came in time, but the encoder was behind
         self._sound_at = sound_at

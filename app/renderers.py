@@ -7,13 +7,12 @@ from typing import Protocol
 import moderngl
 import numpy as np
 from cap4d.app.background import WHITE, Backdrop, Color
+from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
 from cap4d.app.splat_pass import BoundGaussians, SplatPass
 
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.player.avatar import Avatar
-
-Overlay = Backdrop  # its older name
 
 
 class Renderer(Protocol):
@@ -42,7 +41,7 @@ class GlRenderer:
     def __init__(self, ctx: moderngl.Context, avatar: Avatar) -> None:
         self.ctx, self.avatar = ctx, avatar
         self.splats = SplatPass(ctx, bound_gaussians(avatar))
-        self.overlay = Backdrop(ctx)
+        self.backdrop = Backdrop(ctx)
         self.target: moderngl.Framebuffer | None = None
         self.vertices = np.zeros((0, 3), np.float32)
 
@@ -65,7 +64,7 @@ class GlRenderer:
             if self.target is None or self.target.size != picture.size:
                 self.target = self.ctx.simple_framebuffer(picture.size)
             self.target.use()
-            self.overlay.draw(picture, background)
+            self.backdrop.draw(picture, background)
             flat = np.frombuffer(self.target.read(components=4), np.uint8)
         return flat.reshape(camera.height, camera.width, 4)
 
@@ -96,6 +95,29 @@ class CpuRenderer:
             self.picture.repeat_x = self.picture.repeat_y = False
         self.picture.write(image)
         return self.picture
+
+
+def open_gl(wanted: str, avatar: Avatar) -> GlRenderer | None:
+    """OpenGL without a window, its context this thread's; None: the CPU is to draw.
+
+    Args:
+        wanted: `cpu`, `gl`, or `auto`: OpenGL where a GPU is behind it, since a software driver takes several
+            times as long as the CPU renderer.
+    Raises:
+        GlUnavailableError: `gl` is wanted and not there.
+    """
+    if wanted == "cpu":
+        return None
+    try:
+        ctx = headless_context()
+    except GlUnavailableError:
+        if wanted == "gl":
+            raise
+        return None
+    if wanted == "auto" and is_software(ctx):
+        ctx.release()
+        return None
+    return GlRenderer(ctx, avatar)
 
 
 def bound_gaussians(avatar: Avatar) -> BoundGaussians:

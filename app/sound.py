@@ -21,8 +21,6 @@ from cap4d.app.sound_clock import SoundClock
 
 from cap4d.player.sound import Sound
 
-__all__ = ["MiniaudioDevice", "NoDeviceError", "Sound", "SoundDevice", "SoundPlayer", "open_device"]
-
 log = logging.getLogger(__name__)
 
 PERIOD_MS = 20  # that the device asks for at once
@@ -133,9 +131,9 @@ class SoundPlayer:
             device.start(self._fill)
 
     @classmethod
-    def open(cls, sound: Sound, *, loop: float | None = None) -> SoundPlayer:
+    def open(cls, sound: Sound) -> SoundPlayer:
         """On the system's output, or in silence."""
-        return cls(sound, open_device(sound.rate, sound.channels), loop=loop)
+        return cls(sound, open_device(sound.rate, sound.channels))
 
     @property
     def playing(self) -> bool:

@@ -53,7 +53,7 @@ class Taking:
         viewer = self.viewer
         try:
             path = free_path(self.folder, viewer.loaded.path.stem, ".mp4")
-            sound = viewer.soundtrack.player if viewer.soundtrack is not None else None
+            sound = viewer.accompaniment.player if viewer.accompaniment is not None else None
             self.recorder = Recorder(
                 path,
                 _even(size),

@@ -37,15 +37,13 @@ class Icon:
     BACK, FORWARD, REPEAT = "\uf048", "\uf051", "\uf363"
     PHOTO, RECORD = "\uf030", "\uf111"
     RANDOM, RESET, NEUTRAL = "\uf522", "\uf2ea", "\uf118"
-    SEARCH, CLOSE, SIDEBAR = "\uf002", "\uf00d", "\uf0db"
-    LIVE, SOUND = "\uf519", "\uf028"
+    CLOSE, LIVE = "\uf00d", "\uf519"
 
 
 PLAIN = {
     Icon.PLAY: "Play", Icon.PAUSE: "Pause", Icon.STOP: "Stop", Icon.BACK: "<", Icon.FORWARD: ">",
     Icon.REPEAT: "Loop", Icon.PHOTO: "Photo", Icon.RECORD: "Rec", Icon.RANDOM: "Random", Icon.RESET: "Reset",
-    Icon.NEUTRAL: "Neutral", Icon.SEARCH: "Search", Icon.CLOSE: "x", Icon.SIDEBAR: "Panels",
-    Icon.LIVE: "Live", Icon.SOUND: "Sound",
+    Icon.NEUTRAL: "Neutral", Icon.CLOSE: "x", Icon.LIVE: "Live",
 }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from cap4d.app.accompaniment import Accompaniment
 from cap4d.app.background import WHITE, Background, Picture
 from cap4d.app.controls import Controls
 from cap4d.app.dropped import Use, use_of
@@ -24,8 +25,7 @@ from cap4d.app.playback import SPEEDS, ClipPlayback, Playback, StreamPlayback
 from cap4d.app.quality import Quality
 from cap4d.app.recent import RecentFiles
 from cap4d.app.shortcuts import Action
-from cap4d.app.sound import Sound, SoundPlayer
-from cap4d.app.soundtrack import Soundtrack
+from cap4d.app.sound import SoundPlayer
 from cap4d.app.timings import Timings
 from cap4d.app.toasts import Toasts
 
@@ -34,6 +34,7 @@ from cap4d.drive.clip import Frame
 from cap4d.errors import Cap4dError
 from cap4d.player.avatar import Avatar
 from cap4d.player.camera_path import STANDING, camera_path, fitted, with_live_head
+from cap4d.player.sound import Sound
 
 Clock = Callable[[], float]
 
@@ -80,7 +81,7 @@ class Viewer:
         self.dialog: Action | None = None  # OPEN or DRIVE, while its window is open
         self.is_welcome = is_welcome
         self.background: Background = WHITE
-        self.soundtrack: Soundtrack | None = None
+        self.accompaniment: Accompaniment | None = None
         self.overlays: frozenset[Overlay] = frozenset()
         self.overlay_part = Part.ALL
         self.display_hz = 60.0
@@ -205,9 +206,9 @@ class Viewer:
 
     def set_sound(self, sound: Sound | None) -> None:
         """Lets a sound play beside the clip, whose clock it then rules; None: silence."""
-        if self.soundtrack is not None:
-            self.soundtrack.close()
-        self.soundtrack = None if sound is None else Soundtrack(SoundPlayer.open(sound))
+        if self.accompaniment is not None:
+            self.accompaniment.close()
+        self.accompaniment = None if sound is None else Accompaniment(SoundPlayer.open(sound))
         if sound is not None and isinstance(self.playback, ClipPlayback):
             self.playback.rewind(self.now)
 
@@ -268,8 +269,8 @@ class Viewer:
     def _hear(self) -> None:
         """Keeps sound and pictures together, and hears whether a source has given up."""
         playback = self.playback
-        if self.soundtrack is not None:
-            self.soundtrack.follow(playback, self.now)
+        if self.accompaniment is not None:
+            self.accompaniment.follow(playback, self.now)
         if isinstance(playback, StreamPlayback) and self.jobs.label is None:
             if playback.error is not None:
                 self.fail(playback.error)

@@ -144,7 +144,6 @@ class Window:
     def connect(self, listener: Listener) -> None:
         """Tells `listener` what mouse, keyboard and system do."""
         handle = self.handle
-        self._connected = listener
         glfw.set_cursor_pos_callback(handle, lambda _, x, y: listener.pointer(x, y))
         glfw.set_mouse_button_callback(
             handle, lambda _, button, action, mods: listener.button(button, action == glfw.PRESS, mods)

@@ -7,7 +7,6 @@ from fractions import Fraction
 import numpy as np
 
 FULL_RANGE = 2  # AVCOL_RANGE_JPEG
-BEST, WORST = 2, 31  # quantisers of the encoder
 
 
 class JpegEncoder:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from cap4d.app.background import Color
+from cap4d.app.renderers import GlRenderer, open_gl
 
 from cap4d.camera import Camera
 from cap4d.drive.clip import Frame
 from cap4d.player.avatar import Avatar
-
-Color = tuple[float, float, float]
 
 
 class Painter(Protocol):
@@ -47,7 +47,7 @@ class GlPainter:
 
     name = "gl"
 
-    def __init__(self, renderer) -> None:
+    def __init__(self, renderer: GlRenderer) -> None:
         self.renderer = renderer
         self._frame: Frame | None = None
 
@@ -61,24 +61,6 @@ class GlPainter:
 
 
 def choose_painter(wanted: str, avatar: Avatar) -> Painter:
-    """`auto` is OpenGL where a GPU is behind it.
-
-    Raises:
-        GlUnavailableError: `gl` is wanted and not there.
-    """
-    if wanted == "cpu":
-        return CpuPainter(avatar)
-    from cap4d.app.gl_context import GlUnavailableError, headless_context, is_software
-
-    try:
-        ctx = headless_context()
-    except GlUnavailableError:
-        if wanted == "gl":
-            raise
-        return CpuPainter(avatar)
-    if wanted == "auto" and is_software(ctx):
-        ctx.release()
-        return CpuPainter(avatar)
-    from cap4d.app.renderers import GlRenderer
-
-    return GlPainter(GlRenderer(ctx, avatar))
+    """See `open_gl`."""
+    renderer = open_gl(wanted, avatar)
+    return CpuPainter(avatar) if renderer is None else GlPainter(renderer)

@@ -14,7 +14,6 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.drive.clip import Frame
 from cap4d.drive.expressions import expression_groups, expression_names, expression_ranges
 
-LIVE_FPS = 30.0  # pictures of a live stream a second
 MAX_FPS = 66.0  # of a clip; a little above 60, so that its frames need not come to the microsecond
 
 
@@ -32,7 +31,7 @@ class Performance:
         self.groups = expression_groups(bundle)
         self.overrides = Overrides(self.ranges)
         self._index = {name: i for i, name in enumerate(self.names)}
-        self._interval = 1 / (LIVE_FPS if self.is_live else MAX_FPS)
+        self._interval = playback.interval if self.is_live else 1 / MAX_FPS
         self._frozen = False  # a live stream, by somebody's wish
         self._number, self._look = 0, -math.inf  # of the picture due, and when to look for another
 

@@ -10,21 +10,19 @@ from pathlib import Path
 
 from cap4d.app.loading import open_playback
 from cap4d.app.options import Options
-from cap4d.app.serve.gate import Gate, parse_address
+from cap4d.app.serve.door import Door, parse_address
 from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.server import PageServer
 from cap4d.app.serve.studio import Studio
 
 from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
-from cap4d.player.camera_path import camera_path, live_camera_path
+from cap4d.player.camera_path import STANDING, camera_path
 from cap4d.player.offline import head_centre, statistics, write_stats
-from cap4d.player.video import check_file
 
 log = logging.getLogger(__name__)
 
 MAX_WATCHERS = 4
-SIZE = 512, 512  # px of the largest picture, unless told otherwise
 
 
 def play_page(path: Path, options: Options) -> None:
@@ -38,9 +36,7 @@ def play_page(path: Path, options: Options) -> None:
 
     check_options(options)
     host, port = parse_address(options.serve)
-    gate = Gate(host, options.token)
-    if options.stats is not None:
-        check_file(options.stats, "stats")
+    door = Door(host, options.token)
     avatar = Avatar.load(path, deformer=options.deformer)
     with ExitStack() as stack:
         playback = open_playback(options.drive, avatar.bundle, **options.driving)
@@ -49,34 +45,34 @@ def play_page(path: Path, options: Options) -> None:
         if playback.is_live:
             log.info("listening for frames on %s", playback.name)
         fps, centre = 1 / playback.interval, head_centre(avatar)
-        choose = live_camera_path if playback.is_live else camera_path
-        cameras = choose(options.camera, avatar.camera, centre, fps=fps, size=None)
+        cameras = camera_path(options.camera, avatar.camera, centre, fps=fps, size=None)
         studio = Studio(
             avatar,
             Performance(playback, avatar.bundle),
             cameras,
+            turns_head=playback.is_live and options.camera in STANDING,
             backend=options.backend,
-            area=math.prod(options.size or SIZE),
+            area=math.prod(options.picture_size),
             limit=MAX_WATCHERS,
         )
         studio.start()
         stack.callback(_finish, studio, options)
-        serve_studio(studio, gate, port, title=path.stem)
+        serve_studio(studio, door, port, title=path.stem)
 
 
 def _finish(studio: Studio, options: Options) -> None:
     studio.stop()
     if options.stats is not None:
-        write_stats(options.stats, page_statistics(studio, options.size or SIZE))
+        write_stats(options.stats, page_statistics(studio, options.picture_size))
 
 
-def serve_studio(studio: Studio, gate: Gate, port: int, *, title: str) -> None:
+def serve_studio(studio: Studio, door: Door, port: int, *, title: str) -> None:
     """Serves until interrupted, or the studio breaks."""
-    server = PageServer(studio, gate, title=title)
+    server = PageServer(studio, door, title=title)
 
     def ready(port: int) -> None:
-        log.info("%s", gate.address(port))
-        if not gate.loopback:
+        log.info("%s", door.address(port))
+        if not door.loopback:
             log.info("anybody who has this address can watch; the line is not encrypted. Ctrl-C ends it")
 
     async def run() -> None:

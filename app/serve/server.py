@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from importlib.resources import files
 
-from cap4d.app.serve.gate import NOT_ALLOWED, OPEN_PATHS, PAGE, SOCKET, Gate, Refusal
+from cap4d.app.serve.door import NOT_ALLOWED, OPEN_PATHS, PAGE, SOCKET, Door, Refusal
 from cap4d.app.serve.message import MAX_MESSAGE, BadMessageError, parse_message
 from cap4d.app.serve.studio import Studio
 from cap4d.app.serve.watcher import Watcher
@@ -43,13 +43,12 @@ class PageServer:
 
     Args:
         studio: Already started.
-        gate: Who may look.
+        door: Who may look.
         title: Of the page.
     """
 
-    def __init__(self, studio: Studio, gate: Gate, *, title: str) -> None:
-        self.studio, self.gate, self.title = studio, gate, title
-        self.refused = 0  # requests and watchers
+    def __init__(self, studio: Studio, door: Door, *, title: str) -> None:
+        self.studio, self.door, self.title = studio, door, title
         self._sockets: dict[Watcher, object] = {}
         self._connections = 0
         self._files = read_files()
@@ -68,7 +67,7 @@ class PageServer:
         logging.getLogger("websockets").setLevel(logging.CRITICAL)  # what strangers do is not our user's news
         async with serve(
             self._watch,
-            self.gate.host,
+            self.door.host,
             port,
             process_request=self._answer,
             create_connection=self._connection_class(),
@@ -87,14 +86,13 @@ class PageServer:
 
     def _answer(self, connection, request):
         """The file that is asked for; None lets the WebSocket open."""
-        refusal = self.gate.refusal(request.path, SingleHeaders(request.headers))
+        refusal = self.door.refusal(request.path, SingleHeaders(request.headers))
         path = request.path.partition("?")[0]
         if getattr(request, "method", "GET") != "GET":  # older versions refuse others by themselves
             refusal = NOT_ALLOWED
         if refusal is None and path in (PAGE, SOCKET) and self.studio.is_full:
             refusal = Refusal(503, FULL.format(self.studio.limit))
         if refusal is not None:
-            self.refused += 1
             return self._respond(refusal.status, "text/html", self._refusal_page(refusal))
         if path == SOCKET:
             return None
@@ -155,7 +153,6 @@ class PageServer:
 
         watcher = self.studio.admit(deliver)
         if watcher is None:
-            self.refused += 1
             await socket.close(TRY_AGAIN, "full")
             return
         self._sockets[watcher] = socket
@@ -179,7 +176,6 @@ class PageServer:
                     raise BadMessageError("expected fewer messages")
                 message = parse_message(data)
             except BadMessageError as error:
-                self.refused += 1
                 await socket.close(POLICY, str(error))
                 return
             if self.studio.hear(watcher, message):

@@ -41,6 +41,7 @@ class Studio:
         avatar: Drawn by the studio's own thread alone, from `start` on.
         performance: What it does.
         cameras: Where it is seen from until somebody takes the camera.
+        turns_head: A live source turns the head; the cameras know nothing of it.
         backend: `auto`, `gl` or `cpu`.
         area: px that a picture may have.
         limit: Watchers at once.
@@ -53,12 +54,14 @@ class Studio:
         performance: Performance,
         cameras: CameraPath,
         *,
+        turns_head: bool = False,
         backend: str = "auto",
         area: int = 512 * 512,
         limit: int = 4,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.avatar, self.performance, self.cameras = avatar, performance, cameras
+        self.turns_head = turns_head
         self.backend, self.area, self.limit, self.clock = backend, area, limit, clock
         self.centre = head_centre(avatar)
         self.moments = 0  # drawn
@@ -139,7 +142,7 @@ class Studio:
         """Those who have not shown what they were sent for too long."""
         now = self.clock()
         with self._changed:
-            return [watcher for watcher in self._watchers if watcher.pace.stalled(now)]
+            return [watcher for watcher in self._watchers if watcher.flow.stalled(now)]
 
     def introduction(self) -> dict[str, Any]:
         """What a page is told first."""
@@ -175,7 +178,7 @@ class Studio:
         return {"pictures": len(latencies), "latency_ms": found}
 
     def _acknowledge(self, watcher: Watcher, number: int, now: float) -> None:
-        latency = watcher.pace.acknowledged(number, now)
+        latency = watcher.flow.acknowledged(number, now)
         if latency is not None:
             self.latencies.append(latency)
 
@@ -242,8 +245,9 @@ class Studio:
     def _camera(self, shot: Shot, frame: Frame, moment: Moment) -> Camera:
         if shot.orbit is not None:
             camera = shot.orbit.camera(*shot.size)
-            return with_live_head(camera, frame) if self.performance.is_live else camera
-        return fitted(self.cameras(moment[0], frame), shot.size)
+        else:
+            camera = fitted(self.cameras(moment[0], frame), shot.size)
+        return with_live_head(camera, frame) if self.turns_head else camera
 
     def _nap(self, now: float) -> float:
         """s until something may be due by itself; whoever comes or says something ends it."""
@@ -260,7 +264,7 @@ def picture_message(head: dict[str, Any], jpeg: bytes, watcher: Watcher, shot: S
     The head: `n` the picture's number, to be echoed when it is shown; `at` s in the clip; `stream` a live
     stream's state; `drawn` ms; `latency` ms, median of late; `size`; `quantiser`.
     """
-    latency = watcher.pace.latency
+    latency = watcher.flow.latency
     mine = {
         "n": watcher.pictures,
         "latency": None if latency is None else round(latency * 1e3, 1),

@@ -6,12 +6,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cap4d.app.background import WHITE, Color
 from cap4d.app.orbit import Orbit
+from cap4d.app.serve.flow import LEVELS, Flow, Level
 from cap4d.app.serve.message import Message
-from cap4d.app.serve.pace import LEVELS, Level, Pace
 
-Color = tuple[float, float, float]
-WHITE: Color = (1.0, 1.0, 1.0)
 MIN_SIDE = 16  # px
 SHARPEN_SECONDS = 0.3  # after which a picture that stands still is sent at its best
 
@@ -45,15 +44,15 @@ class Watcher:
         self.deliver, self.area = deliver, area
         self.orbit: Orbit | None = None
         self.size = (math.isqrt(area),) * 2
-        self.background = WHITE
-        self.pace = Pace()
+        self.background: Color = WHITE
+        self.flow = Flow()
         self.pictures = 0  # sent so far
         self._shown: tuple[object, Shot] | None = None  # (moment, shot) of the last picture
         self._moved = -math.inf  # when the last picture of something new went out
 
     def shot(self, moment: object, now: float) -> Shot:
         """What it should see of `moment` now: coarser on a slow line, unless it has stood for a while."""
-        level = LEVELS[self.pace.level]
+        level = LEVELS[self.flow.level]
         if self._shown is not None and now - self._moved >= SHARPEN_SECONDS:
             still = self._shot(LEVELS[0])
             shown_moment, shown = self._shown
@@ -63,18 +62,18 @@ class Watcher:
 
     def wants(self, moment: object, now: float) -> bool:
         """Whether a picture of `moment` is to be sent."""
-        return self.pace.ready and self._shown != (moment, self.shot(moment, now))
+        return self.flow.ready and self._shown != (moment, self.shot(moment, now))
 
     def sharpens_at(self) -> float:
         """When a better picture of the same may be due."""
-        return math.inf if self.pace.level == 0 else self._moved + SHARPEN_SECONDS
+        return math.inf if self.flow.level == 0 else self._moved + SHARPEN_SECONDS
 
     def send(self, data: bytes, moment: object, shot: Shot, *, begun: float, now: float) -> None:
         """A picture goes out; its number is `pictures` before the call."""
         if self._shown is None or self._shown[0] != moment or self._shown[1].orbit != shot.orbit:
             self._moved = now
         self._shown = moment, shot
-        self.pace.sent(self.pictures, begun, now)
+        self.flow.sent(self.pictures, begun, now)
         self.pictures += 1
         self.deliver(data)
 

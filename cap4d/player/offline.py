@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +171,7 @@ def render_to(
     avatar.stages.clear()  # the first frame loads what the others find loaded
     start = time.perf_counter()
     with VideoWriter(output.path, fps=fps, sound=sound) if output.path is not None else _Nowhere() as writer:
-        for image in _with_progress(_chain(first, images), total):
+        for image in _with_progress(chain((first,), images), total):
             with avatar.stages.time("write"):
                 writer.write(image)
     seconds = time.perf_counter() - start
@@ -303,8 +304,3 @@ def _with_progress(images: Iterator[np.ndarray], total: int) -> Iterator[np.ndar
             shown = time.perf_counter()
             left = (shown - start) / done * (total - done)
             log.info("frame %d of %d, %.0f s left", done, total, left)
-
-
-def _chain(first: np.ndarray, rest: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    yield first
-    yield from rest

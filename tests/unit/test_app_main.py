@@ -129,15 +129,15 @@ def test_a_demo_that_cannot_be_made_is_a_clear_line(monkeypatch, capsys):
 
 def test_auto_is_the_cpu_where_software_or_nothing_draws(monkeypatch, needs_gl):
     avatar = Avatar(tiny_bundle(network=False))
-    monkeypatch.setattr("cap4d.app.headless.is_software", lambda ctx: True)
+    monkeypatch.setattr("cap4d.app.renderers.is_software", lambda ctx: True)
     assert choose_backend("auto", avatar) == ("cpu", draw_on_cpu)
-    monkeypatch.setattr("cap4d.app.headless.is_software", lambda ctx: False)
+    monkeypatch.setattr("cap4d.app.renderers.is_software", lambda ctx: False)
     assert choose_backend("auto", avatar)[0] == "gl"
 
     def unavailable():
         raise GlUnavailableError("none")
 
-    monkeypatch.setattr("cap4d.app.headless.headless_context", unavailable)
+    monkeypatch.setattr("cap4d.app.renderers.headless_context", unavailable)
     assert choose_backend("auto", avatar) == ("cpu", draw_on_cpu)
     with pytest.raises(GlUnavailableError):
         choose_backend("gl", avatar)

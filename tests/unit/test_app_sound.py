@@ -11,8 +11,10 @@ import time
 import numpy as np
 import pytest
 from cap4d.app import sound as sound_module
-from cap4d.app.sound import MiniaudioDevice, NoDeviceError, Sound, SoundPlayer
+from cap4d.app.sound import MiniaudioDevice, NoDeviceError, SoundPlayer
 from cap4d.app.sound_clock import SoundClock
+
+from cap4d.player.sound import Sound
 
 RATE = 8000
 

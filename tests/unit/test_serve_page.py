@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,9 @@ pytest.importorskip("onnx")
 from cap4d.app.main import main
 from cap4d.app.playback import ClipPlayback
 from cap4d.app.serve import server as server_module
-from cap4d.app.serve.gate import Gate
+from cap4d.app.serve.door import Door
 from cap4d.app.serve.jpeg import JpegEncoder
-from cap4d.app.serve.message import parse_message
+from cap4d.app.serve.message import Message, parse_message
 from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.server import PageServer
 from cap4d.app.serve.studio import Studio
@@ -47,13 +48,13 @@ from cap4d.player.camera_path import camera_path
 PATIENCE = 20.0  # s that anything may take on a busy machine
 
 
-def tiny_studio(*, limit: int = 4, clock: Callable[[], float] = time.monotonic) -> Studio:
+def tiny_studio(*, clock: Callable[[], float] = time.monotonic, **settings) -> Studio:
     """Not started."""
     bundle = tiny_bundle(network=False)
     performance = Performance(ClipPlayback(bundle.idle, clock()), bundle)
     cameras = camera_path("static", bundle.camera, np.zeros(3), fps=24, size=None)
     avatar = Avatar(bundle, deformer="off", threads=1)
-    return Studio(avatar, performance, cameras, backend="cpu", area=128 * 128, limit=limit, clock=clock)
+    return Studio(avatar, performance, cameras, backend="cpu", area=128 * 128, clock=clock, **settings)
 
 
 class Served:
@@ -63,9 +64,9 @@ class Served:
         port: Where; `studio`, `server`: what.
     """
 
-    def __init__(self, gate: Gate, *, limit: int = 4) -> None:
+    def __init__(self, door: Door, *, limit: int = 4) -> None:
         self.studio = tiny_studio(limit=limit)
-        self.gate, self.server = gate, PageServer(self.studio, gate, title="tiny")
+        self.door, self.server = door, PageServer(self.studio, door, title="tiny")
         self.port = 0
 
     def url(self, path: str = "/socket", token: str | None = None) -> str:
@@ -84,9 +85,9 @@ class Served:
 
 
 @contextlib.contextmanager
-def serving(gate: Gate | None = None, **options) -> Iterator[Served]:
+def serving(door: Door | None = None, **options) -> Iterator[Served]:
     """Serves on a free port until the block ends."""
-    served = Served(Gate("127.0.0.1") if gate is None else gate, **options)
+    served = Served(Door("127.0.0.1") if door is None else door, **options)
     served.studio.start()
     listens, loops = threading.Event(), []
     over = asyncio.Event()
@@ -186,7 +187,7 @@ def test_the_page_and_its_files_are_served_with_headers_that_lock_it_down(served
 
 
 @pytest.mark.parametrize(
-    "path", ["/../gate.py", "/page.html", "/server.py", "/etc/passwd", "/%2e%2e/gate.py"]
+    "path", ["/../door.py", "/page.html", "/server.py", "/etc/passwd", "/%2e%2e/door.py"]
 )
 def test_nothing_else_is_there(served, path):
     assert served.get(path)[0] == 404
@@ -214,7 +215,7 @@ def test_another_site_may_not_connect(served):
 
 
 def test_where_others_can_reach_it_the_token_goes_before_everything():
-    with serving(Gate("0.0.0.0", "secret")) as served:
+    with serving(Door("0.0.0.0", "secret")) as served:
         assert served.get("/")[0] == served.get("/?token=wrong")[0] == 403
         assert b"token" in served.get("/")[2]
         for token in (None, "", "wrong"):
@@ -297,6 +298,17 @@ def test_what_one_does_to_the_face_all_see(served):
             other.picture()
 
 
+def test_a_live_head_is_turned_once_whoever_has_the_camera():
+    studio = tiny_studio(turns_head=True)
+    frame = studio._seen = replace(studio.performance.frame(), rot=np.float32([0, 0.5, 0]))
+    watcher = studio.admit(lambda _: None)
+    before = studio._camera(watcher.shot((0, 0), 0.0), frame, (0, 0))
+    assert not np.allclose(before.viewmat, studio.avatar.camera.viewmat, atol=0.1)
+    watcher.look(Message(zoom=0.0), studio._view)
+    taken_over = studio._camera(watcher.shot((0, 0), 0.0), frame, (0, 0))
+    assert np.allclose(taken_over.viewmat, before.viewmat, atol=1e-6)
+
+
 class CountingPainter:
     """Counts, and paints in grey."""
 
@@ -376,7 +388,7 @@ def test_who_connects_and_says_nothing_is_dropped(served, monkeypatch):
 
 
 def test_who_does_not_show_what_is_sent_is_dropped(served, monkeypatch):
-    monkeypatch.setattr("cap4d.app.serve.pace.STALLED", 0.3)
+    monkeypatch.setattr("cap4d.app.serve.flow.STALLED", 0.3)
     with watching(served) as client, pytest.raises(ConnectionClosed):
         while True:
             client.picture(echo=False)

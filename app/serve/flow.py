@@ -34,7 +34,7 @@ class Level:
 LEVELS = (Level(1, 3), Level(1, 5), Level(1, 8), Level(0.75, 8), Level(0.5, 8), Level(0.5, 14))
 
 
-class Pace:
+class Flow:
     """Of one browser. Times in seconds of one clock."""
 
     def __init__(self) -> None:

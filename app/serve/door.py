@@ -55,7 +55,7 @@ def parse_address(text: str) -> tuple[str, int]:
     return host, port
 
 
-class Gate:
+class Door:
     """Answers for one address.
 
     Args:

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cap4d.app.accompaniment import Accompaniment
 from cap4d.app.playback import ClipPlayback, StreamPlayback
 from cap4d.app.sound import SoundPlayer
-from cap4d.app.soundtrack import Soundtrack
 from test_app_playback import Stream
 from tiny_bundle import tiny_clip
 
@@ -24,76 +24,76 @@ class Now:
 
 @pytest.fixture
 def stage():
-    """A clip, a silent player on a clock of our own, and the soundtrack between them."""
+    """A clip, a silent player on a clock of our own, and the accompaniment between them."""
     now = Now()
     player = SoundPlayer(Sound(np.zeros((16_000, 1), np.int16), 8_000), None, clock=now)
-    return now, ClipPlayback(CLIP, 0.0), Soundtrack(player)
+    return now, ClipPlayback(CLIP, 0.0), Accompaniment(player)
 
 
 def run(stage, until, step=0.05):
-    now, playback, soundtrack = stage
+    now, playback, accompaniment = stage
     while now.seconds < until - 1e-9:
         now.seconds += step
-        soundtrack.follow(playback, now.seconds)
+        accompaniment.follow(playback, now.seconds)
         playback.number(now.seconds)
 
 
 def test_both_play_together_through_the_clips_end(stage):
-    _, playback, soundtrack = stage
+    _, playback, accompaniment = stage
     run(stage, 2.5)
-    assert soundtrack.player.loop == pytest.approx(2.0)
-    assert playback.number(2.5) == int(10 * soundtrack.player.position() + 1e-6)
+    assert accompaniment.player.loop == pytest.approx(2.0)
+    assert playback.number(2.5) == int(10 * accompaniment.player.position() + 1e-6)
     assert playback.position == pytest.approx(0.5, abs=0.11)
 
 
 def test_the_sounds_clock_rules(stage):
-    now, playback, soundtrack = stage
+    now, playback, accompaniment = stage
     run(stage, 0.5)
-    soundtrack.player.seek(1.5)  # as a device would that had run ahead
-    soundtrack.follow(playback, now.seconds)
+    accompaniment.player.seek(1.5)  # as a device would that had run ahead
+    accompaniment.follow(playback, now.seconds)
     assert playback.number(now.seconds) == 15
 
 
 def test_a_pause_and_a_jump_of_the_clip_are_the_sounds_too(stage):
-    now, playback, soundtrack = stage
+    now, playback, accompaniment = stage
     run(stage, 0.5)
     playback.toggle(now.seconds)
     run(stage, 1.0)
-    assert not soundtrack.player.playing
+    assert not accompaniment.player.playing
     playback.seek(1.2, now.seconds)
     playback.toggle(now.seconds)
     run(stage, 1.3)
-    assert soundtrack.player.playing
-    assert soundtrack.player.position() == pytest.approx(playback.position, abs=0.11)
+    assert accompaniment.player.playing
+    assert accompaniment.player.position() == pytest.approx(playback.position, abs=0.11)
     assert playback.position == pytest.approx(1.5, abs=0.11)
 
 
 def test_speed_is_followed_and_a_clip_that_stops_stops_the_sound(stage):
-    now, playback, soundtrack = stage
+    now, playback, accompaniment = stage
     run(stage, 0.1)
     playback.set_speed(2.0, now.seconds)
     playback.set_loops(False, now.seconds)
     run(stage, 0.5)
-    assert soundtrack.player.speed == 2
+    assert accompaniment.player.speed == 2
     assert playback.position == pytest.approx(0.9, abs=0.21)  # heard a step of ours late
     run(stage, 2.0)
     assert playback.is_paused
-    assert not soundtrack.player.playing
-    assert soundtrack.player.loop is None
+    assert not accompaniment.player.playing
+    assert accompaniment.player.loop is None
 
 
 def test_another_clip_starts_the_sound_over(stage):
-    now, _, soundtrack = stage
+    now, _, accompaniment = stage
     run(stage, 0.9)
     another = ClipPlayback(CLIP, now.seconds)
-    soundtrack.follow(another, now.seconds)
-    assert soundtrack.player.position() == 0
+    accompaniment.follow(another, now.seconds)
+    assert accompaniment.player.position() == 0
 
 
 def test_beside_a_live_stream_it_just_plays(stage):
-    now, _, soundtrack = stage
-    soundtrack.follow(StreamPlayback(Stream(CLIP.frame(0)), rig_name="tiny"), 0.0)
+    now, _, accompaniment = stage
+    accompaniment.follow(StreamPlayback(Stream(CLIP.frame(0)), rig_name="tiny"), 0.0)
     now.seconds = 1.0
-    assert soundtrack.player.position() == pytest.approx(1.0)
-    soundtrack.close()
-    assert not soundtrack.player.playing
+    assert accompaniment.player.position() == pytest.approx(1.0)
+    accompaniment.close()
+    assert not accompaniment.player.playing

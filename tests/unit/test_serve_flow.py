@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from cap4d.app.orbit import Orbit
 from cap4d.app.playback import ClipPlayback, StreamPlayback
+from cap4d.app.serve.flow import IN_FLIGHT, LEVELS, STALLED, Flow
 from cap4d.app.serve.jpeg import JpegEncoder
 from cap4d.app.serve.message import Message
-from cap4d.app.serve.pace import IN_FLIGHT, LEVELS, STALLED, Pace
 from cap4d.app.serve.performance import Performance
 from cap4d.app.serve.watcher import SHARPEN_SECONDS, Watcher, fitted_size
 
@@ -19,7 +19,7 @@ from cap4d.drive.clip import Clip, Frame
 FPS = 30.0
 
 
-def play(pace: Pace, latency: float, seconds: float, *, start: float = 0.0, number: int = 0) -> int:
+def play(flow: Flow, latency: float, seconds: float, *, start: float = 0.0, number: int = 0) -> int:
     """Pictures at 30 a second, each acknowledged after `latency`; returns the next number."""
     events = []
     for i in range(int(seconds * FPS)):
@@ -27,76 +27,76 @@ def play(pace: Pace, latency: float, seconds: float, *, start: float = 0.0, numb
         events += [(begun, "send", number + i, begun), (begun + latency, "ack", number + i, begun)]
     sent = set()
     for at, kind, n, begun in sorted(events):
-        if kind == "send" and pace.ready:
-            pace.sent(n, begun, at)
+        if kind == "send" and flow.ready:
+            flow.sent(n, begun, at)
             sent.add(n)
         elif kind == "ack" and n in sent:
-            pace.acknowledged(n, at)
+            flow.acknowledged(n, at)
     return number + int(seconds * FPS)
 
 
 def test_two_pictures_are_on_their_way_and_no_more():
-    pace = Pace()
+    flow = Flow()
     for number in range(IN_FLIGHT):
-        assert pace.ready
-        pace.sent(number, 0.0, 0.01)
-    assert not pace.ready
-    assert pace.acknowledged(0, 0.05) == pytest.approx(0.05)
-    assert pace.ready
+        assert flow.ready
+        flow.sent(number, 0.0, 0.01)
+    assert not flow.ready
+    assert flow.acknowledged(0, 0.05) == pytest.approx(0.05)
+    assert flow.ready
 
 
 def test_an_echo_covers_those_before_it_and_a_made_up_one_nothing():
-    pace = Pace()
-    pace.sent(0, 0.0, 0.0)
-    pace.sent(1, 0.1, 0.1)
-    assert pace.acknowledged(2**53, 0.2) is None
-    assert not pace.ready
-    assert pace.acknowledged(0, 0.2) == pytest.approx(0.2)
-    pace.sent(2, 0.3, 0.3)
-    assert pace.acknowledged(2, 0.4) == pytest.approx(0.1)
-    assert pace.acknowledged(2, 0.5) is None
-    assert pace.acknowledged(1, 0.5) is None
-    assert list(pace.latencies) == [pytest.approx(0.2), pytest.approx(0.1)]
+    flow = Flow()
+    flow.sent(0, 0.0, 0.0)
+    flow.sent(1, 0.1, 0.1)
+    assert flow.acknowledged(2**53, 0.2) is None
+    assert not flow.ready
+    assert flow.acknowledged(0, 0.2) == pytest.approx(0.2)
+    flow.sent(2, 0.3, 0.3)
+    assert flow.acknowledged(2, 0.4) == pytest.approx(0.1)
+    assert flow.acknowledged(2, 0.5) is None
+    assert flow.acknowledged(1, 0.5) is None
+    assert list(flow.latencies) == [pytest.approx(0.2), pytest.approx(0.1)]
 
 
 def test_a_picture_that_is_never_shown_is_a_stall():
-    pace = Pace()
-    pace.sent(0, 0.0, 0.0)
-    assert not pace.stalled(STALLED)
-    assert pace.stalled(STALLED + 0.1)
+    flow = Flow()
+    flow.sent(0, 0.0, 0.0)
+    assert not flow.stalled(STALLED)
+    assert flow.stalled(STALLED + 0.1)
 
 
 def test_a_fast_line_keeps_the_best():
-    pace = Pace()
-    play(pace, 0.03, 20)
-    assert pace.level == 0
-    assert pace.latency == pytest.approx(0.03)
+    flow = Flow()
+    play(flow, 0.03, 20)
+    assert flow.level == 0
+    assert flow.latency == pytest.approx(0.03)
 
 
 def test_a_line_that_gets_slow_gets_coarser_pictures_and_later_finer_ones_again():
-    pace = Pace()
-    number = play(pace, 0.03, 2)
-    number = play(pace, 0.4, 20, start=2, number=number)
-    assert pace.level == len(LEVELS) - 1
-    play(pace, 0.03, 60, start=30, number=number)
-    assert pace.level == 0
+    flow = Flow()
+    number = play(flow, 0.03, 2)
+    number = play(flow, 0.4, 20, start=2, number=number)
+    assert flow.level == len(LEVELS) - 1
+    play(flow, 0.03, 60, start=30, number=number)
+    assert flow.level == 0
 
 
 def test_a_line_that_is_long_by_itself_is_not_slow():
-    pace = Pace()
-    play(pace, 0.25, 30)
-    assert pace.level == 0
+    flow = Flow()
+    play(flow, 0.25, 30)
+    assert flow.level == 0
 
 
 def test_finer_pictures_that_were_too_much_are_tried_less_and_less_often():
-    pace = Pace()
-    number, changes, level = play(pace, 0.03, 2), [], 0
+    flow = Flow()
+    number, changes, level = play(flow, 0.03, 2), [], 0
     for i in range(400):  # slow at level 0, fast from 1 on
-        before = pace.level
-        number = play(pace, 0.3 if pace.level == 0 else 0.03, 0.5, start=2 + 0.5 * i, number=number)
-        if pace.level != before and pace.level == 0:
+        before = flow.level
+        number = play(flow, 0.3 if flow.level == 0 else 0.03, 0.5, start=2 + 0.5 * i, number=number)
+        if flow.level != before and flow.level == 0:
             changes.append(i)
-        level = max(level, pace.level)
+        level = max(level, flow.level)
     assert len(changes) >= 3
     assert level == 1
     assert np.diff(changes)[-1] > 2 * np.diff(changes)[0]
@@ -121,18 +121,18 @@ def test_nothing_is_sent_twice():
 
 def test_a_picture_that_stands_is_sharpened_once():
     watcher, moment = Watcher(lambda data: None, area=512 * 512), (0, 0)
-    watcher.pace.level = 4
+    watcher.flow.level = 4
     shot = watcher.shot(moment, 0.0)
     assert shot.size == (256, 256)
     watcher.send(b"", moment, shot, begun=0.0, now=0.0)
-    watcher.pace.acknowledged(0, 0.1)
+    watcher.flow.acknowledged(0, 0.1)
     assert not watcher.wants(moment, SHARPEN_SECONDS - 0.01)
     assert watcher.sharpens_at() == SHARPEN_SECONDS
     assert watcher.wants(moment, SHARPEN_SECONDS)
     sharp = watcher.shot(moment, SHARPEN_SECONDS)
     assert (sharp.size, sharp.quantiser) == ((512, 512), LEVELS[0].quantiser)
     watcher.send(b"", moment, sharp, begun=0.3, now=0.3)
-    watcher.pace.acknowledged(1, 0.4)
+    watcher.flow.acknowledged(1, 0.4)
     assert not watcher.wants(moment, 9.0)
     assert watcher.shot((1, 0), 9.0).size == (256, 256)  # it moves again
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 from cap4d.app.options import parse_options
-from cap4d.app.serve.gate import Gate, is_loopback, parse_address
+from cap4d.app.serve.door import Door, is_loopback, parse_address
 from cap4d.app.serve.message import BadMessageError, parse_message
 from cap4d.app.serve.server import Meter, SingleHeaders
 
@@ -41,9 +41,9 @@ def test_only_this_machines_own_addresses_are_loopback():
 
 
 def test_loopback_needs_no_token_unless_one_is_named():
-    assert Gate("127.0.0.1").refusal("/", HOST) is None
-    assert Gate("127.0.0.1").address(8300) == "http://127.0.0.1:8300/"
-    named = Gate("127.0.0.1", "s")
+    assert Door("127.0.0.1").refusal("/", HOST) is None
+    assert Door("127.0.0.1").address(8300) == "http://127.0.0.1:8300/"
+    named = Door("127.0.0.1", "s")
     assert named.refusal("/", HOST).status == 403
     assert named.refusal("/?token=s", HOST) is None
 
@@ -53,46 +53,46 @@ def test_loopback_needs_no_token_unless_one_is_named():
     "query", ["", "?", "?token=", "?token=S", "?token=secre", "?token=secret2", "?tok=secret"]
 )
 def test_another_address_refuses_all_but_the_token(path, query):
-    gate = Gate("0.0.0.0", "secret")
-    assert gate.refusal(path + query, {"Host": "192.168.1.2:8300"}).status == 403
-    assert gate.refusal(f"{path}?token=secret", {"Host": "192.168.1.2:8300"}) is None
+    door = Door("0.0.0.0", "secret")
+    assert door.refusal(path + query, {"Host": "192.168.1.2:8300"}).status == 403
+    assert door.refusal(f"{path}?token=secret", {"Host": "192.168.1.2:8300"}) is None
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
 def test_an_empty_token_opens_nothing(host):
     with pytest.raises(ArgumentError, match="token: expected a word, got none"):
-        Gate(host, "")
+        Door(host, "")
 
 
 def test_a_token_is_made_up_where_none_is_named_and_stands_in_the_address():
-    gates = Gate("192.168.1.2"), Gate("192.168.1.2")
-    assert gates[0].token != gates[1].token
-    assert len(gates[0].token) >= 20
-    assert gates[0].address(9) == f"http://192.168.1.2:9/?token={gates[0].token}"
+    doors = Door("192.168.1.2"), Door("192.168.1.2")
+    assert doors[0].token != doors[1].token
+    assert len(doors[0].token) >= 20
+    assert doors[0].address(9) == f"http://192.168.1.2:9/?token={doors[0].token}"
 
 
 @pytest.mark.parametrize(
     "host", ["evil.org:8300", "evil.org", "", "127.0.0.1.evil.org", "192.168.1.2:8300", "["]
 )
 def test_on_loopback_a_name_that_is_not_this_machines_is_refused(host):
-    assert Gate("127.0.0.1").refusal("/", {"Host": host}).status == 403
-    assert Gate("127.0.0.1").refusal("/socket", {"Host": host, "Origin": f"http://{host}"}).status == 403
+    assert Door("127.0.0.1").refusal("/", {"Host": host}).status == 403
+    assert Door("127.0.0.1").refusal("/socket", {"Host": host, "Origin": f"http://{host}"}).status == 403
 
 
 @pytest.mark.parametrize(
     "origin", ["http://evil.org", "null", "http://127.0.0.1:9999", "http://localhost:8300", ""]
 )
 def test_only_the_page_itself_may_connect(origin):
-    assert Gate("127.0.0.1").refusal("/socket", HOST | {"Origin": origin}).status == 403
-    assert Gate("127.0.0.1").refusal("/socket", ORIGIN) is None
-    assert Gate("127.0.0.1").refusal("/socket", HOST) is None  # not a browser, which always says
+    assert Door("127.0.0.1").refusal("/socket", HOST | {"Origin": origin}).status == 403
+    assert Door("127.0.0.1").refusal("/socket", ORIGIN) is None
+    assert Door("127.0.0.1").refusal("/socket", HOST) is None  # not a browser, which always says
 
 
 @pytest.mark.parametrize(
     "target",
     [
-        "/../gate.py",
-        "/gate.py",
+        "/../door.py",
+        "/door.py",
         "/page.html",
         "//",
         "",
@@ -104,7 +104,7 @@ def test_only_the_page_itself_may_connect(origin):
     ],
 )
 def test_nothing_but_the_known_files_is_there(target):
-    assert Gate("127.0.0.1").refusal(target, HOST).status == 404
+    assert Door("127.0.0.1").refusal(target, HOST).status == 404
 
 
 def test_a_header_that_is_there_twice_is_not_believed():

@@ -6,11 +6,11 @@ from cap4d.app.playback import ClipPlayback, Playback
 from cap4d.app.sound import SoundPlayer
 
 
-class Soundtrack:
+class Accompaniment:
     """Follows the user's hand on a clip; beside a live stream it just plays.
 
     Args:
-        player: Paused at 0; closed with the soundtrack.
+        player: Paused at 0; closed with the accompaniment.
     """
 
     def __init__(self, player: SoundPlayer) -> None:
