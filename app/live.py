@@ -71,6 +71,7 @@ def open_viewer(path: Path, options: Options) -> Viewer:
         loaded,
         playback,
         fill=options.fill,
+        sender=options.sender,
         camera=options.camera,
         deformer=options.deformer,
         recent=RecentFiles(config_folder() / "recent.json"),

@@ -48,7 +48,7 @@ class Viewer:
     Args:
         loaded: The avatar.
         playback: What drives it; closed with the viewer or when another takes its place.
-        fill: Which fillers live sources get; see `open_playback`.
+        fill, sender: Of live sources; see `open_playback`.
         camera: See `camera_path`.
         deformer: What the user asked for; `auto` is found once the first picture is there.
         recent: The files opened lately.
@@ -63,6 +63,7 @@ class Viewer:
         playback: Playback,
         *,
         fill: Mapping[str, bool] = ALL,
+        sender: Path | None = None,
         camera: str = "static",
         deformer: str = "auto",
         recent: RecentFiles,
@@ -71,7 +72,7 @@ class Viewer:
         executor: Executor | None = None,
     ) -> None:
         self.loaded, self.playback, self.recent, self.clock = loaded, playback, recent, clock
-        self.fill = fill
+        self.fill, self.sender = fill, sender
         self.camera_spec, self.wanted_deformer = camera, deformer
         self.toasts, self.timings, self.quality = Toasts(), Timings(), Quality()
         self.jobs = Jobs(self.fail, executor)
@@ -194,7 +195,7 @@ class Viewer:
         def open_it() -> Playback:
             if self.playback.is_live:
                 self.playback.close()  # the next one may listen to the same address
-            return open_playback(spec, self.loaded.bundle, fill=self.fill)
+            return open_playback(spec, self.loaded.bundle, sender=self.sender, fill=self.fill)
 
         self.jobs.start(f"Opening {name}", open_it, lambda playback: self._play(playback, spec))
 

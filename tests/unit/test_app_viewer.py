@@ -357,3 +357,13 @@ def test_the_dropped_file_may_be_a_string_of_anything(show):
         viewer.open(Path(name))
         viewer.poll()
     assert len(messages(viewer, Tone.ERROR)) == 4  # the oldest gave way
+
+
+def test_a_source_chosen_later_is_opened_as_the_command_line_said(show, monkeypatch):
+    sender, fill, asked = Path("flame.npz"), {"blink": False}, []
+    viewer = show(sender=sender, fill=fill)
+    clip = ClipPlayback(viewer.avatar.idle, 0.0)
+    opened = lambda *_, **settings: asked.append(settings) or clip  # noqa: E731
+    monkeypatch.setattr("cap4d.app.viewer.open_playback", opened)
+    viewer.drive("tcp://127.0.0.1:9000")
+    assert asked == [{"sender": sender, "fill": fill}]
