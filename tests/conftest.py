@@ -39,3 +39,17 @@ def builtin_rig():
     from cap4d.rig.builtin import build_head
 
     return build_head()
+
+
+@pytest.fixture(scope="module")
+def ctx():
+    """An OpenGL context without a window; tests that need it skip where there is none."""
+    from cap4d.app.gl_context import GlUnavailableError, headless_context
+
+    try:
+        context = headless_context()
+    except GlUnavailableError as error:
+        pytest.skip(str(error))
+    yield context
+    context.gc()
+    context.release()

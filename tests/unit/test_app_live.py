@@ -12,7 +12,6 @@ import glfw
 import numpy as np
 import pytest
 from cap4d.app.controls import Drag
-from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.gui import Gui
 from cap4d.app.layout import Rect
 from cap4d.app.live import LivePlayer, choose_renderer, play_live
@@ -97,17 +96,6 @@ class Now:
 
     def __call__(self):
         return self.seconds
-
-
-@pytest.fixture(scope="module")
-def ctx():
-    try:
-        context = headless_context()
-    except GlUnavailableError as error:
-        pytest.skip(str(error))
-    yield context
-    context.gc()
-    context.release()
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ pytest.importorskip("onnx")
 from dataclasses import replace
 
 from cap4d.app.background import Backdrop, Checkerboard
-from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.layout import Rect
 from cap4d.app.overlays.color_map import color_map
 from cap4d.app.overlays.legend import Legend, rounded_up, ticks
@@ -97,17 +96,6 @@ def test_asking_for_it_changes_nothing() -> None:
 
 
 # With a context
-
-
-@pytest.fixture(scope="module")
-def ctx():
-    try:
-        context = headless_context()
-    except GlUnavailableError as error:
-        pytest.skip(str(error))
-    yield context
-    context.gc()
-    context.release()
 
 
 @pytest.mark.parametrize("kind", [GlRenderer, CpuRenderer])
