@@ -26,6 +26,7 @@ from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
 from cap4d.app.window import DisplayUnavailableError, Window
 from imgui_bundle import imgui
+from stepped_clock import SteppedClock
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import write_bundle
@@ -88,16 +89,6 @@ class Pane:
         self.clipboard = text
 
 
-class Now:
-    """A clock that goes when it is told to."""
-
-    def __init__(self):
-        self.seconds = 100.0
-
-    def __call__(self):
-        return self.seconds
-
-
 @pytest.fixture(scope="module")
 def avatar():
     return Avatar(tiny_bundle(network=False))
@@ -109,7 +100,7 @@ def play(ctx, avatar, tmp_path):
     players = []
 
     def make(backend="cpu", size=(120, 90), density=1, **settings):
-        pane, clock = Pane(ctx, size, density), Now()
+        pane, clock = Pane(ctx, size, density), SteppedClock()
         loaded = Loaded(tmp_path / "tiny.cap4d", avatar, head_centre(avatar))
         playback = ClipPlayback(avatar.idle, clock())
         recent = RecentFiles(tmp_path / "recent.json")
@@ -173,7 +164,7 @@ def test_with_panels_the_picture_keeps_to_its_place(play, avatar, backend, densi
 
 def test_it_shows_the_number_of_pictures_asked_for_and_counts_them(play):
     player, pane = play()
-    pane.wait = lambda seconds: setattr(player.clock, "seconds", player.clock() + max(seconds, 0.001))
+    pane.wait = lambda seconds: setattr(player.clock, "now", player.clock() + max(seconds, 0.001))
     player.run(5)
     stats = player.statistics()
     assert stats["frames"] == 5
@@ -188,7 +179,7 @@ def test_a_paused_window_draws_nothing_until_something_changes(play):
     player.viewer.act(Action.PLAY)
     settle(player)
     shown = len(pane.pictures)
-    player.clock.seconds += 10
+    player.clock.now += 10
     assert not player.step()
     assert player._pause() > 0.1
     player.viewer.controls.scroll(1)
@@ -402,7 +393,7 @@ def test_a_failing_source_costs_its_pictures_and_is_said(play):
     playback = player.viewer.playback
     playback.clip = replace(playback.clip, expr=np.full_like(playback.clip.expr, np.nan))
     for _ in range(3):
-        player.clock.seconds += 1 / 24
+        player.clock.now += 1 / 24
         player.step()
     (toast,) = player.viewer.toasts.current(player.clock())
     assert toast.count == 3

@@ -50,7 +50,7 @@ def test_a_recording_starts_goes_on_and_ends(taking, tmp_path):
     assert viewer.recording_since == viewer.now
     for _ in range(4):
         taking.add(HALF)
-        viewer.clock.seconds += 0.1
+        viewer.clock.now += 0.1
     taking.toggle_recording((49, 33))
     viewer.poll()
     assert viewer.recording_since is None
