@@ -1,12 +1,7 @@
-"""The playing window: its loop on a framebuffer of our own, its input, and the real thing under Xvfb."""
+"""The playing window: its loop on a framebuffer of our own, and its input."""
 
 import json
-import os
-import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import glfw
 import numpy as np
@@ -24,7 +19,6 @@ from cap4d.app.renderers import CpuRenderer, GlRenderer
 from cap4d.app.shortcuts import Action
 from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
-from cap4d.app.window import DisplayUnavailableError, Window
 from imgui_bundle import imgui
 from stepped_clock import SteppedClock
 from tiny_bundle import tiny_bundle
@@ -34,7 +28,6 @@ from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import head_centre
 
-HERE = Path(__file__).resolve().parent
 PANELS = 720, 420  # a window that is large enough for all of them
 
 
@@ -437,16 +430,6 @@ def test_a_failing_panel_costs_its_panels_only(play, monkeypatch, caplog):
     assert (pane.pictures[-1][200:, 400:].max(-1) > 150).any()
 
 
-@pytest.mark.skipif(
-    not sys.platform.startswith("linux"), reason="X11 and Wayland are found through the environment"
-)
-def test_no_display_is_one_line(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(DisplayUnavailableError, match="expected a display, found none"):
-        Window("test", 64, 64)
-
-
 def test_ctrl_c_keeps_what_was_measured(tmp_path, monkeypatch):
     class Interrupted:
         def __init__(self, *_):
@@ -467,46 +450,3 @@ def test_ctrl_c_keeps_what_was_measured(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         play_live(tmp_path / "a.cap4d", parse_options(["--stats", str(stats)]), None)
     assert json.loads(stats.read_text()) == {"frames": 3}
-
-
-WINDOW_PROGRAM = """
-import sys
-import numpy as np
-from pathlib import Path
-from cap4d.app.live import play_live
-from cap4d.app.options import parse_options
-from cap4d.app.window import Window
-
-class Watched(Window):
-    def swap(self):
-        self.last = np.frombuffer(self.ctx.screen.read(components=3), np.uint8)
-        super().swap()
-
-options = parse_options(sys.argv[2:])
-with Watched("test", *options.size) as window:
-    play_live(options.avatar, options, window)
-    np.save(sys.argv[1], window.last.reshape(*window.framebuffer_size[::-1], 3)[::-1])
-"""
-
-
-@pytest.mark.parametrize("backend", ["cpu", "gl"])
-def test_a_real_window_opens_plays_and_closes(backend, tmp_path):
-    if shutil.which("xvfb-run") is None or shutil.which("xauth") is None:
-        pytest.skip("needs xvfb-run and xauth")
-    write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
-    arguments = ["tiny.cap4d", "--frames", "12", "--size", "200x160", "--backend", backend]
-    program = [sys.executable, "-c", WINDOW_PROGRAM, "last.npy", *arguments]
-    environment = os.environ | {
-        "PYTHONPATH": str(HERE.parent),
-        "LIBGL_ALWAYS_SOFTWARE": "1",
-        "XDG_CONFIG_HOME": str(tmp_path),
-    }
-    run = ["xvfb-run", "-a", *program]
-    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
-    if "window: expected OpenGL 4.1" in done.stderr:
-        pytest.skip("the X server has no OpenGL 4.1")
-    assert done.returncode == 0, done.stderr
-    picture = np.load(tmp_path / "last.npy")
-    assert picture.shape == (160, 200, 3)
-    assert (picture[-10:, -10:] == 255).all()
-    assert picture[60:100, 80:120].std() > 3
