@@ -175,17 +175,18 @@ def test_a_message_too_large_is_hung_up_on(served):
 
 
 def test_a_flood_is_hung_up_on(served):
-    with watching(served) as client, pytest.raises(ConnectionClosed):
+    with watching(served) as client, pytest.raises(ConnectionClosed) as closed:
         for _ in range(20_000):
             client.say(home=True)
         while True:
             client.line.recv(timeout=PATIENCE)
+    assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "expected fewer messages")
 
 
-def test_who_connects_and_says_nothing_is_dropped(served, monkeypatch):
+def test_who_connects_and_says_nothing_is_dropped(monkeypatch):
     monkeypatch.setattr(server_module, "OPENING_SECONDS", 0.3)
     with serving() as quick, socket.create_connection(("127.0.0.1", quick.port)) as silent:
-        silent.settimeout(PATIENCE)
+        silent.settimeout(6.0)  # the package's own patience is 10 s
         assert silent.recv(10) == b""
 
 
@@ -201,6 +202,7 @@ def test_who_does_not_take_what_is_sent_is_dropped(monkeypatch):
         await asyncio.Event().wait()
 
     monkeypatch.setattr(PageServer, "_send", send_nothing)
+    monkeypatch.setattr("cap4d.app.serve.pace.STALLED", float("inf"))  # that would drop it as well, later
     with (
         serving() as served,
         connect(served.url(), compression=None, proxy=None) as line,
@@ -213,6 +215,7 @@ def test_who_does_not_take_what_is_sent_is_dropped(monkeypatch):
 
 def test_connections_have_a_limit(monkeypatch):
     monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 3)
+    monkeypatch.setattr(server_module, "OPENING_SECONDS", 2 * PATIENCE)  # after it all are hung up on
     with serving() as served:
         lines = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(3)]
         with socket.create_connection(("127.0.0.1", served.port)) as extra:
@@ -220,4 +223,7 @@ def test_connections_have_a_limit(monkeypatch):
             with contextlib.suppress(ConnectionResetError):
                 assert extra.recv(10) == b""
         for line in lines:
+            line.setblocking(False)
+            with pytest.raises(BlockingIOError):  # still open
+                line.recv(10)
             line.close()
