@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from receiving import closed, connect, line, port_of, running
+from receiving import PATIENCE, closed, connect, line, port_of, running
 
 from cap4d.drive import tcp
 from cap4d.drive.packet import Receiver
@@ -100,6 +100,18 @@ def test_tcp_connections_that_say_nothing_are_hung_up_on(monkeypatch) -> None:
         with connect(receiver) as sender:
             sender.sendall(line(1.0))
             sink.until(lambda: sink.stamps() == [1.0])
+
+
+def test_tcp_connections_are_limited(monkeypatch) -> None:
+    monkeypatch.setattr(tcp, "GREETING", 10 * PATIENCE)  # after it all are hung up on
+    receiver = TcpReceiver("127.0.0.1", 0)
+    with running(receiver) as sink:
+        crowd = [connect(receiver) for _ in range(tcp.MAX_CONNECTIONS + 3)]
+        for sock in crowd[tcp.MAX_CONNECTIONS :]:
+            closed(sock)
+        sink.until(lambda: sink.causes == {"sender": 3})
+        for sock in crowd:
+            sock.close()
 
 
 def test_tcp_a_flood_is_cut_and_the_work_bounded() -> None:
