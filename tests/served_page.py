@@ -123,6 +123,13 @@ class Client:
             self.say(ack=head["n"])
         return head, data[data.index(b"\xff\xd8") :]
 
+    def until(self, seen: Callable[[dict], bool]) -> None:
+        """Takes pictures until the state told last is the one looked for, or fails."""
+        end = time.monotonic() + PATIENCE
+        while not seen(self.told[-1].get("state", {})):
+            assert time.monotonic() < end, self.told[-1]
+            self.picture()
+
     def silent(self, seconds: float) -> bool:
         """Whether nothing comes for that long."""
         try:

@@ -111,7 +111,9 @@ def test_no_more_than_two_pictures_come_unanswered(served):
 def test_a_paused_picture_is_sent_once_a_drag_sends_another_and_home_the_first_again(served):
     with watching(served) as client:
         client.say(play=False, seek=0.1, size=[100, 100])
+        until = time.monotonic() + PATIENCE
         while True:
+            assert time.monotonic() < until
             head, first = client.picture()
             if head["size"] == [100, 100] and client.silent(0.5):
                 break
@@ -130,11 +132,9 @@ def test_what_one_does_to_the_face_all_see(served):
     with watching(served) as one, watching(served) as other:
         one.say(expr={"jawOpen": 0.75, "no such": 1})
         for client in (one, other):
-            while client.told[-1].get("state", {}).get("held") != {"jawOpen": 0.75}:
-                client.picture()
+            client.until(lambda state: state.get("held") == {"jawOpen": 0.75})
         one.say(reset=True, expr={"jawOpen": None})
-        while other.told[-1]["state"]["held"]:
-            other.picture()
+        other.until(lambda state: state.get("held") == {})
 
 
 def test_one_too_many_is_told_so_and_let_in_when_another_has_left():
