@@ -90,9 +90,10 @@ def test_deformation_is_what_stands_in_for_the_network() -> None:
 def test_asking_for_it_changes_nothing() -> None:
     avatar = Avatar(tiny_bundle(12))
     frame = avatar.idle.frame(2)
-    before = avatar.move(frame).copy()
+    before, deformation = avatar.move(frame).copy(), avatar.deformation().copy()
     avatar.deformation()[:] = 7
     np.testing.assert_array_equal(avatar.move(frame), before)
+    np.testing.assert_array_equal(avatar.deformation(), deformation)
 
 
 # With a context
