@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import socket
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import pytest
 from receiving import PATIENCE, closed, connect, line, running
 
+from cap4d.drive.packet import Receiver
 from cap4d.drive.wire import MAX_LINE
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
 
 
 @pytest.fixture
@@ -20,6 +27,15 @@ def web():
     from cap4d.drive.websocket import WebSocketReceiver
 
     return WebSocketReceiver, dial
+
+
+@contextmanager
+def hung_up_on(dial, receiver: Receiver, why: str | None = None) -> Iterator[ClientConnection]:
+    """A connection that the receiver ends, for that reason, before the body does."""
+    from websockets.exceptions import ConnectionClosed
+
+    with dial(receiver.address) as sender, pytest.raises(ConnectionClosed, match=why):
+        yield sender
 
 
 def test_websocket_takes_text_and_binary_messages_of_a_line_or_several(web) -> None:
@@ -34,12 +50,10 @@ def test_websocket_takes_text_and_binary_messages_of_a_line_or_several(web) -> N
 
 
 def test_websocket_a_giant_message_ends_its_sender_and_nobody_else(web) -> None:
-    from websockets.exceptions import ConnectionClosed
-
     make, dial = web
     receiver = make("127.0.0.1", 0)
     with running(receiver) as sink:
-        with dial(receiver.address) as sender, pytest.raises(ConnectionClosed):
+        with hung_up_on(dial, receiver) as sender:
             sender.send(b"x" * (MAX_LINE + 1))
             sender.recv(timeout=PATIENCE)
         sink.until(lambda: sink.causes == {"size": 1})
@@ -119,13 +133,11 @@ def test_websocket_what_is_no_websocket_is_hung_up_on(web) -> None:
 
 
 def test_websocket_connections_that_say_nothing_are_hung_up_on(web, monkeypatch) -> None:
-    from websockets.exceptions import ConnectionClosed
-
     make, dial = web
     monkeypatch.setattr("cap4d.drive.websocket.GREETING", 0.2)
     receiver = make("127.0.0.1", 0)
     with running(receiver) as sink:
-        with dial(receiver.address) as sender, pytest.raises(ConnectionClosed, match="silent"):
+        with hung_up_on(dial, receiver, "silent") as sender:
             sender.recv(timeout=PATIENCE)
         with connect(receiver) as half_open:
             half_open.sendall(b"GET / HTT")
@@ -134,13 +146,11 @@ def test_websocket_connections_that_say_nothing_are_hung_up_on(web, monkeypatch)
 
 
 def test_websocket_messages_without_a_line_are_silence(web, monkeypatch) -> None:
-    from websockets.exceptions import ConnectionClosed
-
     make, dial = web
     monkeypatch.setattr("cap4d.drive.websocket.GREETING", 0.3)
     receiver = make("127.0.0.1", 0)
     with running(receiver) as sink:
-        with dial(receiver.address) as sender, pytest.raises(ConnectionClosed, match="silent"):
+        with hung_up_on(dial, receiver, "silent") as sender:
             end = time.monotonic() + PATIENCE
             while time.monotonic() < end:
                 sender.send(b"\n" * 1000)
