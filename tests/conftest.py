@@ -39,3 +39,38 @@ def builtin_rig():
     from cap4d.rig.builtin import build_head
 
     return build_head()
+
+
+@pytest.fixture(scope="module")
+def ctx():
+    """An OpenGL context without a window; tests that need it skip where there is none."""
+    from cap4d.app.gl_context import GlUnavailableError, headless_context
+
+    try:
+        context = headless_context()
+    except GlUnavailableError as error:
+        pytest.skip(str(error))
+    yield context
+    context.gc()
+    context.release()
+
+
+@pytest.fixture(scope="module")
+def served():
+    """A page that is served over loopback."""
+    from served_page import serving
+
+    with serving() as found:
+        yield found
+
+
+@pytest.fixture
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """tiny.cap4d in the current folder, which is the test's own."""
+    from tiny_bundle import tiny_bundle
+
+    from cap4d.bundle import write_bundle
+
+    monkeypatch.chdir(tmp_path)
+    write_bundle(tiny_bundle(network=False), "tiny.cap4d")
+    return tmp_path / "tiny.cap4d"

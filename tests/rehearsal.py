@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+from stepped_clock import SteppedClock
 
 from cap4d.bundle import Bundle
 from cap4d.drive.convert import Converter
@@ -72,16 +73,6 @@ def between(clip: np.ndarray, position: np.ndarray) -> np.ndarray:
     return (1 - blend) * clip[at % len(clip)] + blend * clip[(at + 1) % len(clip)]
 
 
-class SteppedClock:
-    """Seconds that go on only when told to."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 def rehearse(
     bundle: Bundle,
     vertices: np.ndarray,
@@ -97,7 +88,7 @@ def rehearse(
     Everything happens one after the other on a stepped clock: the numbers are the same on any machine. What
     a real one adds is the time it takes to draw.
     """
-    clock, avatar = SteppedClock(), Avatar(bundle)
+    clock, avatar = SteppedClock(1000.0), Avatar(bundle)
     receiver = TcpReceiver("127.0.0.1", 0, clock=clock)
     stream = LiveStream(receiver, Converter(bundle, template=template), clock=clock)
     line, sent, rows, start = BadLine(impairment, frame_time=1 / SOURCE_FPS), 0, [], clock.now

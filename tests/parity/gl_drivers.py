@@ -33,3 +33,14 @@ def drawn_with(driver: str, program: str, output: Path) -> dict[str, np.ndarray]
     if driver not in str(found["driver"]):
         pytest.skip(f"{driver} is not installed: got {found['driver']}")
     return found
+
+
+def context_or_exit():
+    """An OpenGL context for such a program; where there is none, the program ends with NO_DRIVER."""
+    from cap4d.app.gl_context import GlUnavailableError, headless_context
+
+    try:
+        return headless_context()
+    except GlUnavailableError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(NO_DRIVER) from None

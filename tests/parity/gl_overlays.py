@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from gl_drivers import NO_DRIVER
+from gl_drivers import context_or_exit
 from gl_scenes import view
 from tiny_bundle import tiny_bundle
 
@@ -46,16 +46,11 @@ def lone_faces() -> list[int]:
 
 
 def draw_on_gl(output: str) -> None:
-    from cap4d.app.gl_context import GlUnavailableError, headless_context
     from cap4d.app.overlays.overlays import Overlay, Overlays
     from cap4d.app.overlays.surface_pass import SurfacePass
     from cap4d.app.renderers import CpuRenderer, GlRenderer
 
-    try:
-        ctx = headless_context()
-    except GlUnavailableError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(NO_DRIVER) from None
+    ctx = context_or_exit()
     found = {"driver": np.array(ctx.info["GL_RENDERER"])}
     player, camera, frame = avatar(), near(), avatar().idle.frame(2)
     vertices = player.vertices(frame.expr, eye_rot=frame.eye_rot, neck_rot=frame.neck_rot)

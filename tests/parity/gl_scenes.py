@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from gl_drivers import NO_DRIVER
+from gl_drivers import context_or_exit
 from tiny_bundle import tiny_bundle
 
 from cap4d import _core
@@ -166,15 +166,10 @@ def scene(name: str) -> Scene:
 
 def draw_on_gl(output: str) -> None:
     """Writes every scene's premultiplied picture, an avatar's frames, and the driver's name."""
-    from cap4d.app.gl_context import GlUnavailableError, headless_context
     from cap4d.app.renderers import GlRenderer
     from cap4d.app.splat_pass import BoundGaussians, SplatPass
 
-    try:
-        ctx = headless_context()
-    except GlUnavailableError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(NO_DRIVER) from None
+    ctx = context_or_exit()
     pictures = {"driver": np.array(ctx.info["GL_RENDERER"])}
 
     def draw(scene: Scene, texture_type: str = "f4") -> np.ndarray:

@@ -25,7 +25,9 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
     max_leaves=12,
 )
-KEYS = ("t", "rig", "expr", "arkit", "vertices", "eye_rot", "rot", "tra", "token")
+VALUE_KEYS = ("expr", "arkit", "vertices")
+TURN_KEYS = ("eye_rot", "neck_rot", "jaw_rot", "rot", "tra")
+KEYS = ("t", "rig", *VALUE_KEYS, *TURN_KEYS, "token")
 
 
 def parse(line: bytes) -> Packet | None:
@@ -37,10 +39,12 @@ def parse(line: bytes) -> Packet | None:
 
 
 def sound(packet: Packet) -> bool:
-    arrays = [getattr(packet, name) for name in ("expr", "arkit", "vertices", "eye_rot", "rot", "tra")]
-    given = [array for array in arrays[:3] if array is not None]
-    return len(given) == 1 and all(
-        a is None or (a.dtype == np.float32 and np.isfinite(a).all()) for a in arrays
+    arrays = [getattr(packet, name) for name in (*VALUE_KEYS, *TURN_KEYS)]
+    values = sum(getattr(packet, name) is not None for name in VALUE_KEYS)
+    return (
+        values == 1
+        and np.isfinite(packet.t)
+        and all(a is None or (a.dtype == np.float32 and np.isfinite(a).all()) for a in arrays)
     )
 
 

@@ -7,6 +7,7 @@ import pytest
 from cap4d.app.accompaniment import Accompaniment
 from cap4d.app.playback import ClipPlayback, StreamPlayback
 from cap4d.app.sound import SoundPlayer
+from stepped_clock import SteppedClock
 from test_app_playback import Stream
 from tiny_bundle import tiny_clip
 
@@ -15,27 +16,20 @@ from cap4d.player.sound import Sound
 CLIP = replace(tiny_clip(20), fps=10.0)
 
 
-class Now:
-    seconds = 0.0
-
-    def __call__(self):
-        return self.seconds
-
-
 @pytest.fixture
 def stage():
     """A clip, a silent player on a clock of our own, and the accompaniment between them."""
-    now = Now()
-    player = SoundPlayer(Sound(np.zeros((16_000, 1), np.int16), 8_000), None, clock=now)
-    return now, ClipPlayback(CLIP, 0.0), Accompaniment(player)
+    clock = SteppedClock(0.0)
+    player = SoundPlayer(Sound(np.zeros((16_000, 1), np.int16), 8_000), None, clock=clock)
+    return clock, ClipPlayback(CLIP, 0.0), Accompaniment(player)
 
 
 def run(stage, until, step=0.05):
-    now, playback, accompaniment = stage
-    while now.seconds < until - 1e-9:
-        now.seconds += step
-        accompaniment.follow(playback, now.seconds)
-        playback.number(now.seconds)
+    clock, playback, accompaniment = stage
+    while clock.now < until - 1e-9:
+        clock.now += step
+        accompaniment.follow(playback, clock.now)
+        playback.number(clock.now)
 
 
 def test_both_play_together_through_the_clips_end(stage):
@@ -47,21 +41,21 @@ def test_both_play_together_through_the_clips_end(stage):
 
 
 def test_the_sounds_clock_rules(stage):
-    now, playback, accompaniment = stage
+    clock, playback, accompaniment = stage
     run(stage, 0.5)
     accompaniment.player.seek(1.5)  # as a device would that had run ahead
-    accompaniment.follow(playback, now.seconds)
-    assert playback.number(now.seconds) == 15
+    accompaniment.follow(playback, clock.now)
+    assert playback.number(clock.now) == 15
 
 
 def test_a_pause_and_a_jump_of_the_clip_are_the_sounds_too(stage):
-    now, playback, accompaniment = stage
+    clock, playback, accompaniment = stage
     run(stage, 0.5)
-    playback.toggle(now.seconds)
+    playback.toggle(clock.now)
     run(stage, 1.0)
     assert not accompaniment.player.playing
-    playback.seek(1.2, now.seconds)
-    playback.toggle(now.seconds)
+    playback.seek(1.2, clock.now)
+    playback.toggle(clock.now)
     run(stage, 1.3)
     assert accompaniment.player.playing
     assert accompaniment.player.position() == pytest.approx(playback.position, abs=0.11)
@@ -69,10 +63,10 @@ def test_a_pause_and_a_jump_of_the_clip_are_the_sounds_too(stage):
 
 
 def test_speed_is_followed_and_a_clip_that_stops_stops_the_sound(stage):
-    now, playback, accompaniment = stage
+    clock, playback, accompaniment = stage
     run(stage, 0.1)
-    playback.set_speed(2.0, now.seconds)
-    playback.set_loops(False, now.seconds)
+    playback.set_speed(2.0, clock.now)
+    playback.set_loops(False, clock.now)
     run(stage, 0.5)
     assert accompaniment.player.speed == 2
     assert playback.position == pytest.approx(0.9, abs=0.21)  # heard a step of ours late
@@ -83,17 +77,17 @@ def test_speed_is_followed_and_a_clip_that_stops_stops_the_sound(stage):
 
 
 def test_another_clip_starts_the_sound_over(stage):
-    now, _, accompaniment = stage
+    clock, _, accompaniment = stage
     run(stage, 0.9)
-    another = ClipPlayback(CLIP, now.seconds)
-    accompaniment.follow(another, now.seconds)
+    another = ClipPlayback(CLIP, clock.now)
+    accompaniment.follow(another, clock.now)
     assert accompaniment.player.position() == 0
 
 
 def test_beside_a_live_stream_it_just_plays(stage):
-    now, _, accompaniment = stage
+    clock, _, accompaniment = stage
     accompaniment.follow(StreamPlayback(Stream(CLIP.frame(0)), rig_name="tiny"), 0.0)
-    now.seconds = 1.0
+    clock.now = 1.0
     assert accompaniment.player.position() == pytest.approx(1.0)
     accompaniment.close()
     assert not accompaniment.player.playing

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from cap4d.app import background as background_module
 from cap4d.app.background import CHECK_PX, Backdrop, Checkerboard, Picture, cover
-from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.renderers import CpuRenderer, GlRenderer
 from cap4d.app.screenshot import save_screenshot, straight
 from tiny_bundle import tiny_bundle
@@ -122,17 +121,6 @@ def test_an_image_covers() -> None:
 
 
 # Pictures
-
-
-@pytest.fixture(scope="module")
-def ctx():
-    try:
-        context = headless_context()
-    except GlUnavailableError as error:
-        pytest.skip(str(error))
-    yield context
-    context.gc()
-    context.release()
 
 
 def laid(ctx, picture: np.ndarray, background, *, upright: bool = False) -> np.ndarray:

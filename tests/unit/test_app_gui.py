@@ -3,7 +3,6 @@
 import glfw
 import numpy as np
 import pytest
-from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.gui import SETTLE, Gui
 from imgui_bundle import imgui
 
@@ -18,17 +17,6 @@ class Clipboard:
 
     def copy(self, text):
         self.text = text
-
-
-@pytest.fixture(scope="module")
-def ctx():
-    try:
-        context = headless_context()
-    except GlUnavailableError as error:
-        pytest.skip(str(error))
-    yield context
-    context.gc()
-    context.release()
 
 
 @pytest.fixture

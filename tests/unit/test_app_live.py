@@ -1,18 +1,12 @@
-"""The playing window: its loop on a framebuffer of our own, its input, and the real thing under Xvfb."""
+"""The playing window: its loop on a framebuffer of our own, and its input."""
 
 import json
-import os
-import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import glfw
 import numpy as np
 import pytest
 from cap4d.app.controls import Drag
-from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.gui import Gui
 from cap4d.app.layout import Rect
 from cap4d.app.live import LivePlayer, choose_renderer, play_live
@@ -25,8 +19,8 @@ from cap4d.app.renderers import CpuRenderer, GlRenderer
 from cap4d.app.shortcuts import Action
 from cap4d.app.taking import Taking
 from cap4d.app.viewer import Viewer
-from cap4d.app.window import DisplayUnavailableError, Window
 from imgui_bundle import imgui
+from stepped_clock import SteppedClock
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import write_bundle
@@ -34,7 +28,6 @@ from cap4d.errors import ArgumentError
 from cap4d.player.avatar import Avatar
 from cap4d.player.offline import head_centre
 
-HERE = Path(__file__).resolve().parent
 PANELS = 720, 420  # a window that is large enough for all of them
 
 
@@ -89,27 +82,6 @@ class Pane:
         self.clipboard = text
 
 
-class Now:
-    """A clock that goes when it is told to."""
-
-    def __init__(self):
-        self.seconds = 100.0
-
-    def __call__(self):
-        return self.seconds
-
-
-@pytest.fixture(scope="module")
-def ctx():
-    try:
-        context = headless_context()
-    except GlUnavailableError as error:
-        pytest.skip(str(error))
-    yield context
-    context.gc()
-    context.release()
-
-
 @pytest.fixture(scope="module")
 def avatar():
     return Avatar(tiny_bundle(network=False))
@@ -121,7 +93,7 @@ def play(ctx, avatar, tmp_path):
     players = []
 
     def make(backend="cpu", size=(120, 90), density=1, **settings):
-        pane, clock = Pane(ctx, size, density), Now()
+        pane, clock = Pane(ctx, size, density), SteppedClock()
         loaded = Loaded(tmp_path / "tiny.cap4d", avatar, head_centre(avatar))
         playback = ClipPlayback(avatar.idle, clock())
         recent = RecentFiles(tmp_path / "recent.json")
@@ -185,7 +157,7 @@ def test_with_panels_the_picture_keeps_to_its_place(play, avatar, backend, densi
 
 def test_it_shows_the_number_of_pictures_asked_for_and_counts_them(play):
     player, pane = play()
-    pane.wait = lambda seconds: setattr(player.clock, "seconds", player.clock() + max(seconds, 0.001))
+    pane.wait = lambda seconds: setattr(player.clock, "now", player.clock() + max(seconds, 0.001))
     player.run(5)
     stats = player.statistics()
     assert stats["frames"] == 5
@@ -200,7 +172,7 @@ def test_a_paused_window_draws_nothing_until_something_changes(play):
     player.viewer.act(Action.PLAY)
     settle(player)
     shown = len(pane.pictures)
-    player.clock.seconds += 10
+    player.clock.now += 10
     assert not player.step()
     assert player._pause() > 0.1
     player.viewer.controls.scroll(1)
@@ -414,7 +386,7 @@ def test_a_failing_source_costs_its_pictures_and_is_said(play):
     playback = player.viewer.playback
     playback.clip = replace(playback.clip, expr=np.full_like(playback.clip.expr, np.nan))
     for _ in range(3):
-        player.clock.seconds += 1 / 24
+        player.clock.now += 1 / 24
         player.step()
     (toast,) = player.viewer.toasts.current(player.clock())
     assert toast.count == 3
@@ -458,16 +430,6 @@ def test_a_failing_panel_costs_its_panels_only(play, monkeypatch, caplog):
     assert (pane.pictures[-1][200:, 400:].max(-1) > 150).any()
 
 
-@pytest.mark.skipif(
-    not sys.platform.startswith("linux"), reason="X11 and Wayland are found through the environment"
-)
-def test_no_display_is_one_line(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(DisplayUnavailableError, match="expected a display, found none"):
-        Window("test", 64, 64)
-
-
 def test_ctrl_c_keeps_what_was_measured(tmp_path, monkeypatch):
     class Interrupted:
         def __init__(self, *_):
@@ -488,46 +450,3 @@ def test_ctrl_c_keeps_what_was_measured(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         play_live(tmp_path / "a.cap4d", parse_options(["--stats", str(stats)]), None)
     assert json.loads(stats.read_text()) == {"frames": 3}
-
-
-WINDOW_PROGRAM = """
-import sys
-import numpy as np
-from pathlib import Path
-from cap4d.app.live import play_live
-from cap4d.app.options import parse_options
-from cap4d.app.window import Window
-
-class Watched(Window):
-    def swap(self):
-        self.last = np.frombuffer(self.ctx.screen.read(components=3), np.uint8)
-        super().swap()
-
-options = parse_options(sys.argv[2:])
-with Watched("test", *options.size) as window:
-    play_live(options.avatar, options, window)
-    np.save(sys.argv[1], window.last.reshape(*window.framebuffer_size[::-1], 3)[::-1])
-"""
-
-
-@pytest.mark.parametrize("backend", ["cpu", "gl"])
-def test_a_real_window_opens_plays_and_closes(backend, tmp_path):
-    if shutil.which("xvfb-run") is None or shutil.which("xauth") is None:
-        pytest.skip("needs xvfb-run and xauth")
-    write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
-    arguments = ["tiny.cap4d", "--frames", "12", "--size", "200x160", "--backend", backend]
-    program = [sys.executable, "-c", WINDOW_PROGRAM, "last.npy", *arguments]
-    environment = os.environ | {
-        "PYTHONPATH": str(HERE.parent),
-        "LIBGL_ALWAYS_SOFTWARE": "1",
-        "XDG_CONFIG_HOME": str(tmp_path),
-    }
-    run = ["xvfb-run", "-a", *program]
-    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
-    if "window: expected OpenGL 4.1" in done.stderr:
-        pytest.skip("the X server has no OpenGL 4.1")
-    assert done.returncode == 0, done.stderr
-    picture = np.load(tmp_path / "last.npy")
-    assert picture.shape == (160, 200, 3)
-    assert (picture[-10:, -10:] == 255).all()
-    assert picture[60:100, 80:120].std() > 3

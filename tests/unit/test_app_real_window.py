@@ -41,6 +41,7 @@ with WatchedWindow("test", 760, 480) as window:
     found["orbit before"] = viewer.controls.orbit is not None
     drag(player, (150, 200), (220, 210))
     found["orbit after"] = viewer.controls.orbit is not None
+    found["before"] = viewer.controls.orbit.distance
     xdotool(player, "mousemove", 200, 200, "click", 4)
     found["nearer"] = viewer.controls.orbit.distance
     xdotool(player, "key", "s")
@@ -92,6 +93,7 @@ def test_a_real_pointer_and_keyboard_work_it(tmp_path):
     assert 0.4 < found["value"] <= 1
     assert found["changed"] > 500  # px of the face
     assert (found["orbit before"], found["orbit after"]) == (False, True)
+    assert found["nearer"] < found["before"]
     assert (tmp_path / "tiny_0001.png").is_file()
     assert (tmp_path / "tiny_0001.mp4").stat().st_size > 1000
     assert any("broken.cap4d" in text for text in found["messages"])

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from cap4d.app.gl_context import GlUnavailableError, headless_context
 from cap4d.app.shader_source import ShaderError, build_program, read_package_shader, shader_source
 
 FILES = {
@@ -18,16 +17,6 @@ def read(name: str, files=FILES) -> str:
     if name not in files:
         raise FileNotFoundError(name)
     return files[name]
-
-
-@pytest.fixture(scope="module")
-def ctx():
-    try:
-        context = headless_context()
-    except GlUnavailableError as error:
-        pytest.skip(str(error))
-    yield context
-    context.release()
 
 
 def test_a_chunk_is_included_once_and_keeps_its_line_numbers():

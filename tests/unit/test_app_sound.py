@@ -13,6 +13,7 @@ import pytest
 from cap4d.app import sound as sound_module
 from cap4d.app.sound import MiniaudioDevice, NoDeviceError, SoundPlayer
 from cap4d.app.sound_clock import SoundClock
+from stepped_clock import SteppedClock
 
 from cap4d.player.sound import Sound
 
@@ -34,18 +35,9 @@ class FakeDevice:
         self.closed = True
 
 
-class Clock:
-    """Time that passes when told to."""
-
-    now = 100.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def clock():
-    return Clock()
+    return SteppedClock()
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from cap4d.app.recent import RecentFiles
 from cap4d.app.shortcuts import Action
 from cap4d.app.toasts import Tone
 from cap4d.app.viewer import Viewer
+from stepped_clock import SteppedClock
 from test_app_playback import Stream
 from tiny_bundle import RIG_NAME, tiny_bundle
 
@@ -33,13 +34,6 @@ class AtOnce(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
-
-
-class Now:
-    seconds = 50.0
-
-    def __call__(self):
-        return self.seconds
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +57,7 @@ def show(files, tmp_path):
         loaded = load_avatar(files / name, settings.get("deformer", "auto"))
         playback = open_playback(None, loaded.bundle)
         recent = RecentFiles(tmp_path / "recent.json")
-        clock = Now()
+        clock = SteppedClock()
         viewer = Viewer(loaded, playback, recent=recent, clock=clock, executor=AtOnce(), **settings)
         playback.rewind(clock())
         viewers.append(viewer)
@@ -126,7 +120,7 @@ def test_a_new_picture_is_due_only_when_something_changed(show):
     viewer = show()
     viewer.act(Action.PLAY)
     seen = viewer.number()
-    viewer.clock.seconds += 10
+    viewer.clock.now += 10
     assert viewer.number() == seen
     changes = (
         lambda: viewer.overrides.hold(0, 0.5),

@@ -10,20 +10,14 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from arkit_weights import arkit_weights
 from drive_bundle import on_rig
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import Bundle
-from cap4d.drive.arkit import COLUMN, NAMES, apple_name, arkit_map, gaze_of, look_weights
+from cap4d.drive.arkit import NAMES, apple_name, arkit_map, gaze_of, look_weights
 from cap4d.errors import ArgumentError
 from cap4d.rig.head import HeadRig
-
-
-def weights(**values: float) -> np.ndarray:
-    found = np.zeros(len(NAMES), np.float32)
-    for name, value in values.items():
-        found[COLUMN[name]] = value
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +43,7 @@ def test_the_built_in_head_has_all_of_them(builtin: Bundle) -> None:
     found = arkit_map(builtin)
     assert found.missing == () and not found.error_mm.any() and not found.jaw_rot.any()
     for name in NAMES:
-        expr, _, _ = found(weights(**{name: 0.7}))
+        expr, _, _ = found(arkit_weights(**{name: 0.7}))
         moved = [builtin.subject.expression_names[i] for i in np.flatnonzero(expr)]
         assert moved == [name] and np.isclose(expr.max(), 0.7)
 
@@ -58,7 +52,7 @@ def test_ict_lacks_the_tongue_alone_and_splits_two(ict: Bundle) -> None:
     found = arkit_map(ict)
     assert found.missing == ("tongueOut",) and not found.error_mm.any()
     names = ict.subject.expression_names
-    moved = lambda **values: [names[i] for i in np.flatnonzero(found(weights(**values))[0])]  # noqa: E731
+    moved = lambda **values: [names[i] for i in np.flatnonzero(found(arkit_weights(**values))[0])]  # noqa: E731
     assert moved(browInnerUp=1) == ["browInnerUp_L", "browInnerUp_R"]
     assert moved(cheekPuff=1) == ["cheekPuff_L", "cheekPuff_R"]
     assert moved(eyeBlinkLeft=1) == ["eyeBlink_L"] and moved(tongueOut=1) == []
@@ -72,17 +66,17 @@ def test_left_is_the_persons_left_on_both_rigs(rig: str, request: pytest.Fixture
     for name in NAMES:
         if not name.endswith("Left") or name.startswith(("jaw", "mouthLeft", "eyeLook")):
             continue
-        offsets = subject.pose(found(weights(**{name: 1}))[0]) - subject.pose(0 * found.expr[:, 0])
+        offsets = subject.pose(found(arkit_weights(**{name: 1}))[0]) - subject.pose(0 * found.expr[:, 0])
         moved = np.linalg.norm(offsets, axis=1)
         assert (moved * subject.neutral[:, 0]).sum() / moved.sum() > 0.005, name
     for name in ("jawLeft", "mouthLeft"):
-        offsets = subject.pose(found(weights(**{name: 1}))[0]) - subject.pose(0 * found.expr[:, 0])
+        offsets = subject.pose(found(arkit_weights(**{name: 1}))[0]) - subject.pose(0 * found.expr[:, 0])
         assert offsets[np.linalg.norm(offsets, axis=1).argmax(), 0] > 0.003, name
 
 
 def test_gaze_by_weight() -> None:
     """Against a row of a recording by the app: what its weights give and the angles it measured, rad."""
-    row = weights(
+    row = arkit_weights(
         eyeLookOutLeft=0.5030736923,
         eyeLookUpLeft=0.3807524741,
         eyeLookInRight=0.5970684290,
@@ -90,7 +84,7 @@ def test_gaze_by_weight() -> None:
     )
     yaws, pitches = np.array([0.3596782684, 0.3029436469]), np.array([-0.1741501987, -0.1741401106])
     assert np.allclose(gaze_of(row), [pitches.mean(), yaws.mean(), 0], atol=0.02)
-    down = weights(eyeLookDownLeft=0.2062367648, eyeLookDownRight=0.2062445730)
+    down = arkit_weights(eyeLookDownLeft=0.2062367648, eyeLookDownRight=0.2062445730)
     assert np.isclose(gaze_of(down)[0], 0.1260434, atol=5e-4)
 
 
@@ -101,7 +95,7 @@ def test_gaze_there_and_back() -> None:
 
 def test_gaze_moves_the_eyes_towards_where_it_says(builtin: Bundle) -> None:
     """Left is +x: an iris that looks to the person's left goes there."""
-    _, eye_rot, _ = arkit_map(builtin)(weights(eyeLookOutLeft=1, eyeLookInRight=1))
+    _, eye_rot, _ = arkit_map(builtin)(arkit_weights(eyeLookOutLeft=1, eyeLookInRight=1))
     subject = builtin.subject
     eyes = [j for j, driver in enumerate(subject.joint_drivers) if driver == "eyes"]
     balls = subject.skin_weights[:, eyes].sum(1) > 0.99

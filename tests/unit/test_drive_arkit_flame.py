@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from arkit_weights import arkit_weights
 from drive_bundle import on_rig
 
 from cap4d.bundle import Bundle
@@ -22,13 +23,6 @@ from cap4d.errors import DataError
 from cap4d.rig.head import HeadRig
 
 UPPER_LIP, LOWER_LIP = 3531, 3504  # vertices inside FLAME's lips
-
-
-def weights(**values: float) -> np.ndarray:
-    found = np.zeros(len(NAMES), np.float32)
-    for name, value in values.items():
-        found[COLUMN[name]] = value
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +76,7 @@ def with_jaw(standin: HeadRig) -> HeadRig:
 
 def opening(rig: HeadRig, bundle: Bundle, **values: float) -> float:
     """mm between the lips."""
-    expr, _, jaw_rot = arkit_map(bundle)(weights(**values))
+    expr, _, jaw_rot = arkit_map(bundle)(arkit_weights(**values))
     vertices = rig.subject().pose(expr, jaw_rot=jaw_rot)
     return 1e3 * float(vertices[UPPER_LIP, 1] - vertices[LOWER_LIP, 1])
 
@@ -146,8 +140,8 @@ def test_a_jaw_turns_where_there_is_one(avatars: dict) -> None:
 
 def test_blinks_are_the_rigs_own(avatars: dict) -> None:
     for _, bundle in avatars.values():
-        expr, _, _ = arkit_map(bundle)(weights(eyeBlinkLeft=1, eyeBlinkRight=1, jawOpen=0.2))
-        assert np.isclose(expr[64] - arkit_map(bundle)(weights(jawOpen=0.2))[0][64], 1, atol=1e-5)
+        expr, _, _ = arkit_map(bundle)(arkit_weights(eyeBlinkLeft=1, eyeBlinkRight=1, jawOpen=0.2))
+        assert np.isclose(expr[64] - arkit_map(bundle)(arkit_weights(jawOpen=0.2))[0][64], 1, atol=1e-5)
 
 
 def test_without_a_blink_of_its_own_one_is_found_in_the_basis(standin: HeadRig) -> None:
@@ -175,16 +169,16 @@ def test_without_a_blink_of_its_own_one_is_found_in_the_basis(standin: HeadRig) 
 def test_left_stays_left(avatars: dict) -> None:
     rig, bundle = avatars["no_jaw"]
     subject, found = rig.subject(), arkit_map(bundle)
-    neutral = subject.pose(found(weights())[0])
+    neutral = subject.pose(found(arkit_weights())[0])
     for name in ("mouthSmileLeft", "browDownLeft", "noseSneerLeft", "cheekSquintLeft"):
-        moved = np.linalg.norm(subject.pose(found(weights(**{name: 1}))[0]) - neutral, axis=1)
+        moved = np.linalg.norm(subject.pose(found(arkit_weights(**{name: 1}))[0]) - neutral, axis=1)
         assert (moved * subject.neutral[:, 0]).sum() / moved.sum() > 0.01, name
 
 
 def test_the_converter_rests_with_closed_lips(avatars: dict) -> None:
     rig, bundle = avatars["no_jaw"]
     convert = Converter(bundle)
-    rest, driven = convert.neutral(), convert(Packet(0, arkit=weights()))
+    rest, driven = convert.neutral(), convert(Packet(0, arkit=arkit_weights()))
     assert np.array_equal(rest.expr, driven.expr) and rest.expr.any()
     vertices = rig.subject().pose(rest.expr)
     assert 1e3 * abs(vertices[UPPER_LIP, 1] - vertices[LOWER_LIP, 1]) < 5

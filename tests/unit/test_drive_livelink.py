@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from drive_bundle import on_rig
+from receiving import datagrams, running, until_heard
 from tiny_bundle import tiny_bundle
 
 from cap4d.bundle import Bundle
@@ -380,3 +381,11 @@ def test_what_is_no_recording_is_refused_in_one_line(text: str, field: str, tmp_
 def test_a_missing_recording(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         open_source(str(tmp_path / "none.csv"), tiny_bundle(8, network=False))
+
+
+def test_live_link_can_be_run_again() -> None:
+    receiver = LiveLinkReceiver("127.0.0.1", 0)
+    with running(receiver):
+        pass
+    with running(receiver) as sink, datagrams(receiver) as send:
+        until_heard(sink, lambda: send(b"garbage"), lambda: sink.causes["syntax"])

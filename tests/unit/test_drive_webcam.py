@@ -151,14 +151,20 @@ def test_pictures_that_nobody_had_time_for_are_dropped_and_counted():
 
 
 def test_it_stops_while_the_camera_hangs():
-    script, hangs = Script(range(1)), threading.Event()
-    script.read = lambda: hangs.wait(LONG) and None
-    stop = threading.Event()
+    script, hangs, stop = Script(range(1)), threading.Event(), threading.Event()
+    reading = threading.Event()
+
+    def read():
+        reading.set()
+        hangs.wait(LONG)
+
+    script.read = read
     receiver = WebcamReceiver("0", None, camera=script.open, detector=script.detector, head=landmark_head())
     running = threading.Thread(target=receiver.run, args=(Got(), stop))
     running.start()
+    assert reading.wait(LONG)
     stop.set()
-    running.join(LONG)
+    running.join(LONG / 4)  # while it still hangs
     assert not running.is_alive()
     hangs.set()
 
