@@ -5,12 +5,13 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
 import pytest
 from receiving import PATIENCE, closed, connect, line, running
 
+from cap4d.drive.listener import MAX_CONNECTIONS
 from cap4d.drive.packet import Receiver
 from cap4d.drive.wire import MAX_LINE
 
@@ -155,6 +156,20 @@ def test_websocket_messages_without_a_line_are_silence(web, monkeypatch) -> None
             while time.monotonic() < end:
                 sender.send(b"\n" * 1000)
                 time.sleep(0.02)
+        assert sink.causes == {"sender": 1}
+
+
+def test_websocket_connections_are_limited(web, monkeypatch) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    make, dial = web
+    monkeypatch.setattr("cap4d.drive.websocket.GREETING", 10 * PATIENCE)  # after it all are hung up on
+    receiver = make("127.0.0.1", 0)
+    with running(receiver) as sink, ExitStack() as crowd:
+        for _ in range(MAX_CONNECTIONS):
+            crowd.enter_context(dial(receiver.address))
+        with pytest.raises(InvalidStatus, match="503"), dial(receiver.address):
+            pass
         assert sink.causes == {"sender": 1}
 
 
