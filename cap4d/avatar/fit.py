@@ -20,6 +20,7 @@ from cap4d.avatar.corrections import Corrections
 from cap4d.avatar.model import create_avatar
 from cap4d.avatar.paint import paint
 from cap4d.avatar.presets import Preset, preset_named
+from cap4d.avatar.references import Selection, select, split_selected
 from cap4d.avatar.report import FitReport, compare, summarise, write_sheet
 from cap4d.avatar.trainer import Trainer
 from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, split_views, spread
@@ -31,7 +32,7 @@ from cap4d.rig.head import HeadRig
 
 log = logging.getLogger(__name__)
 
-ABLATIONS = (None, "unet")
+ABLATIONS = (None, "unet", "mmdm")
 PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
 
@@ -45,6 +46,8 @@ def fit(
     resume: bool = False,
     ablate: str | None = None,
     seed: int = 0,
+    references: Sequence[tuple[str, int]] | None = None,
+    hold_out: Sequence[str] = (),
 ) -> FitReport:
     """Fits an avatar and writes it, its report and its picture.
 
@@ -55,14 +58,19 @@ def fit(
         output: `.cap4d` file to write.
         preset: Name of a preset, or one.
         resume: Go on from the checkpoint of an interrupted fit, if there is one.
-        ablate: `unet` leaves the deformation network out.
+        ablate: `unet` leaves the deformation network out; `mmdm` the generated captures (all but the first).
         seed: Same seed, same machine: same avatar.
+        references: (camera, frame) of the images of the first capture to train on; None: all that are not
+            held out.
+        hold_out: Cameras of the first capture that are never trained on.
     Raises:
         ArgumentError: An unknown preset or ablation, or no frame to train on.
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
     """
     if ablate not in ABLATIONS:
-        raise ArgumentError(f"ablate: expected unet, got {ablate!r}")
+        raise ArgumentError(f"ablate: expected unet or mmdm, got {ablate!r}")
+    if ablate == "mmdm":
+        captures = captures[:1]
     if not output.parent.is_dir() or output.is_dir():
         raise ArgumentError(f"output: expected a file in a folder that exists, got {output}")
     settings = preset_named(preset) if isinstance(preset, str) else preset
@@ -72,10 +80,11 @@ def fit(
     loaded = [Capture.load(path) for path in captures]
     for capture in loaded:
         check_rig(capture, rig)
-    split = split_views(loaded, load_views(loaded, settings.image_size))
+    selection = select(loaded[0], references, hold_out)
+    split = split_captures(loaded, selection, settings.image_size)
     trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed)
     checkpoint = output.with_suffix(".fit.ckpt")
-    data = fingerprint(captures, settings)
+    data = fingerprint(captures, settings, selection)
     kind = f"preset {settings.name}, rig {rig.name}, ablate {ablate}, seed {seed}, data {data}"
     spent = 0.0
     if resume and checkpoint.exists():
@@ -129,9 +138,16 @@ def prepare(
     return Trainer(model, corrections, split.train, preset, seed=seed)
 
 
-def fingerprint(captures: Sequence[Path], settings: Preset) -> str:
-    """Twelve hex digits that change with the settings and with what was tracked: whose checkpoint it is."""
-    digest = hashlib.sha256(repr(settings).encode())
+def split_captures(captures: Sequence[Capture], selection: Selection | None, image_size: int) -> Split:
+    """The views to train on and those to be judged by."""
+    if selection is None:
+        return split_views(captures, load_views(captures, image_size))
+    return split_selected(captures, selection, image_size)
+
+
+def fingerprint(captures: Sequence[Path], settings: Preset, selection: Selection | None = None) -> str:
+    """Twelve hex digits that change with settings, selection and what was tracked: whose checkpoint it is."""
+    digest = hashlib.sha256(repr(settings if selection is None else (settings, selection)).encode())
     for path in captures:
         digest.update((path / "fit.npz").read_bytes())
     return digest.hexdigest()[:12]

@@ -42,10 +42,49 @@ def add(commands) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted fit"
     )
-    parser.add_argument("--ablate", choices=("unet",), help="leave a part out, to see what it is worth")
+    parser.add_argument(
+        "--ablate", choices=("unet", "mmdm"), help="leave a part out, to see what it is worth"
+    )
+    add_reference_options(parser)
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="same seed, same machine: same avatar (default: 0)"
     )
+
+
+def add_reference_options(parser: argparse.ArgumentParser) -> None:
+    """What is trained on, where it is not everything."""
+    parser.add_argument(
+        "--references",
+        metavar="N|FILE.json",
+        help="train on so many images of the first capture, chosen by view and expression, or on those that "
+        "a file lists as [[camera, frame], ...] (default: all that are not held out)",
+    )
+    parser.add_argument(
+        "--reference-seed",
+        type=int,
+        default=0,
+        metavar="S",
+        help="another choice of N images, from a random half (default: 0, from all)",
+    )
+    parser.add_argument(
+        "--hold-out-cameras",
+        metavar="A,B",
+        help="cameras of the first capture that are never trained on (default: none)",
+    )
+
+
+def chosen_references(arguments: argparse.Namespace, rig, hold_out: tuple[str, ...]):
+    """(camera, frame) pairs, or None for all."""
+    from cap4d.avatar.references import choose_references, read_references
+    from cap4d.capture.capture import Capture
+
+    wanted = arguments.references
+    if wanted is None:
+        return None
+    capture = Capture.load(arguments.captures[0])
+    if not wanted.lstrip("-").isdecimal():
+        return read_references(Path(wanted), capture)
+    return choose_references(capture, rig, int(wanted), hold_out=hold_out, seed=arguments.reference_seed)
 
 
 def run_fit(arguments: argparse.Namespace) -> None:
@@ -53,12 +92,16 @@ def run_fit(arguments: argparse.Namespace) -> None:
     from cap4d.rig.store import load_rig
 
     check_output(arguments.output)
+    rig = load_rig(arguments.rig)
+    hold_out = tuple(filter(None, (arguments.hold_out_cameras or "").split(",")))
     fit(
         arguments.captures,
-        load_rig(arguments.rig),
+        rig,
         arguments.output,
         preset=arguments.preset,
         resume=arguments.resume,
         ablate=arguments.ablate,
         seed=arguments.seed,
+        references=chosen_references(arguments, rig, hold_out),
+        hold_out=hold_out,
     )
