@@ -26,12 +26,12 @@ from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, 
 from cap4d.camera import opencv_from_rig
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError
-from cap4d.rig.grid import build_grid
+from cap4d.rig.grid import build_grid, own_triangles
 from cap4d.rig.head import HeadRig
 
 log = logging.getLogger(__name__)
 
-ABLATIONS = (None, "unet")
+ABLATIONS = (None, "unet", "remesh")
 PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
 
@@ -55,14 +55,15 @@ def fit(
         output: `.cap4d` file to write.
         preset: Name of a preset, or one.
         resume: Go on from the checkpoint of an interrupted fit, if there is one.
-        ablate: `unet` leaves the deformation network out.
+        ablate: `unet` leaves the deformation network out; `remesh` the UV grid too: the Gaussians ride on the
+            rig's own triangles (`own_triangles`), as in GaussianAvatars.
         seed: Same seed, same machine: same avatar.
     Raises:
         ArgumentError: An unknown preset or ablation, or no frame to train on.
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
     """
     if ablate not in ABLATIONS:
-        raise ArgumentError(f"ablate: expected unet, got {ablate!r}")
+        raise ArgumentError(f"ablate: expected unet or remesh, got {ablate!r}")
     if not output.parent.is_dir() or output.is_dir():
         raise ArgumentError(f"output: expected a file in a folder that exists, got {output}")
     settings = preset_named(preset) if isinstance(preset, str) else preset
@@ -111,11 +112,11 @@ def prepare(
     model = create_avatar(
         rig,
         captures[0].shape,
-        grid=build_grid(rig, preset.grid_size),
+        grid=own_triangles(rig) if ablate == "remesh" else build_grid(rig, preset.grid_size),
         gaussians=preset.gaussians,
         per_face=preset.per_face,
         sh_degree=preset.sh_degree,
-        deformer_width=None if ablate == "unet" else preset.deformer_width,
+        deformer_width=preset.deformer_width if ablate is None else None,
         generator=generator,
     )
     pivot = opencv_from_rig(model.subject.neutral.mean(0)).numpy()

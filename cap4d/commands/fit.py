@@ -42,7 +42,11 @@ def add(commands) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted fit"
     )
-    parser.add_argument("--ablate", choices=("unet",), help="leave a part out, to see what it is worth")
+    parser.add_argument(
+        "--ablate",
+        choices=("unet", "remesh"),
+        help="leave a part out, to see what it is worth: the deformation network, or the UV grid with it",
+    )
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="same seed, same machine: same avatar (default: 0)"
     )
