@@ -156,7 +156,7 @@ def digest(data: bytes) -> str:
 
 
 def _check_version(where: str, manifest: Manifest) -> None:
-    """What a version brought makes a file unreadable to readers of those before, so such a file must say so."""
+    """What a version brought makes a file unreadable to older readers, so such a file must say so."""
     brought = {
         "precision mixed": (2, manifest.precision == "mixed"),
         "deformer": (2, bool(manifest.tier_errors)),

@@ -147,8 +147,9 @@ def bundle_counts(bundle: Bundle) -> dict[str, int]:
 
 
 def stored_subject(bundle: Bundle) -> Subject:
-    """The subject that goes into the file: on the rig's vertices where those are fewer than the grid's. Of the
-    rig's own triangles `subject` is on the rig's vertices itself.
+    """The subject that goes into the file: on the rig's vertices where those are fewer than the grid's.
+
+    Of the rig's own triangles, `subject` stands on the rig's vertices itself.
     """
     mesh = bundle.mesh_subject
     return mesh if mesh is not None and len(mesh.neutral) < len(bundle.subject.neutral) else bundle.subject

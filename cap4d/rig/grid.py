@@ -1,5 +1,5 @@
-"""The surface that carries an avatar's Gaussians: as a rule the UV grid, a rig's surface resampled on a square
-image, so that a convolution can move it (facts 16-19); or the rig's own triangles, which only the rig moves.
+"""The surface that carries an avatar's Gaussians: as a rule the UV grid, a rig's surface resampled on a
+square image, so that a convolution can move it (facts 16-19); or the rig's own triangles.
 
 Pixel (row, column) of a grid of S x S is the surface point at v = (row + 0.5) / S, u = 1 - (column + 0.5) /
 S: the texture turned by 180 degrees, as the released system has it. The map from rig vertices to grid
@@ -28,8 +28,8 @@ NO_AREA = 1e-12  # m^2: a triangle a micrometre across
 class UvGrid:
     """A fixed remesh of a rig; G is the number of pixels that lie on the surface, M the number of triangles.
 
-    The rig's own triangles are one of size 0: its vertices are the rig's, none lies on a pixel, and no network
-    can see or move them.
+    The rig's own triangles are one of size 0: its vertices are the rig's, none lies on a pixel, and no
+    network can see or move them.
 
     Args:
         size: S, pixels a side; 0: the rig's own triangles.
@@ -126,8 +126,8 @@ def own_triangles(rig: HeadRig) -> UvGrid:
     """
     faces = np.asarray(rig.faces, np.int32)
     corners = rig.template.astype(np.float64)[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    kept = np.flatnonzero(area > NO_AREA)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    kept = np.flatnonzero(np.linalg.norm(normals, axis=1) > 2 * NO_AREA)
     first = np.unique(np.sort(faces[kept], axis=1), axis=0, return_index=True)[1]
     if not len(first):
         raise ArgumentError(f"{rig.name}: expected triangles that have an area, got {len(faces)} without")
