@@ -117,9 +117,9 @@ def build_grid(rig: HeadRig, size: int = 128) -> UvGrid:
 def own_triangles(rig: HeadRig) -> UvGrid:
     """The rig's own mesh, as GaussianAvatars uses it (Qian et al. 2024): needs no UVs and takes no network.
 
-    Left out are triangles that have no area, which have no frame for a Gaussian (seams that only hold an atlas
-    together, both ends of a half-sphere), and those that lie on another of the same corners, whichever way
-    they face: the two sides of one triangle would be fitted twice.
+    Left out are triangles that have no area, which have no frame for a Gaussian (seams that only hold an
+    atlas together, both ends of a half-sphere), and those that lie on another of the same corners, whichever
+    way they face: the two sides of one triangle would be fitted twice.
 
     Raises:
         ArgumentError: The rig has no triangle with an area.
