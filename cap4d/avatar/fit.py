@@ -27,12 +27,12 @@ from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, 
 from cap4d.camera import opencv_from_rig
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError
-from cap4d.rig.grid import build_grid
+from cap4d.rig.grid import build_grid, own_triangles
 from cap4d.rig.head import HeadRig
 
 log = logging.getLogger(__name__)
 
-ABLATIONS = (None, "unet", "mmdm")
+ABLATIONS = (None, "unet", "remesh", "mmdm")
 PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
 
@@ -58,7 +58,9 @@ def fit(
         output: `.cap4d` file to write.
         preset: Name of a preset, or one.
         resume: Go on from the checkpoint of an interrupted fit, if there is one.
-        ablate: `unet` leaves the deformation network out; `mmdm` the generated captures (all but the first).
+        ablate: `unet` leaves the deformation network out; `remesh` the UV grid too: the Gaussians ride on the
+            rig's own triangles (`own_triangles`), as in GaussianAvatars; `mmdm` the generated captures, which
+            are all but the first.
         seed: Same seed, same machine: same avatar.
         references: (camera, frame) of the images of the first capture to train on; None: all that are not
             held out.
@@ -68,7 +70,7 @@ def fit(
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
     """
     if ablate not in ABLATIONS:
-        raise ArgumentError(f"ablate: expected unet or mmdm, got {ablate!r}")
+        raise ArgumentError(f"ablate: expected unet, remesh or mmdm, got {ablate!r}")
     if ablate == "mmdm":
         captures = captures[:1]
     if not output.parent.is_dir() or output.is_dir():
@@ -120,11 +122,11 @@ def prepare(
     model = create_avatar(
         rig,
         captures[0].shape,
-        grid=build_grid(rig, preset.grid_size),
+        grid=own_triangles(rig) if ablate == "remesh" else build_grid(rig, preset.grid_size),
         gaussians=preset.gaussians,
         per_face=preset.per_face,
         sh_degree=preset.sh_degree,
-        deformer_width=None if ablate == "unet" else preset.deformer_width,
+        deformer_width=None if ablate in ("unet", "remesh") else preset.deformer_width,
         generator=generator,
     )
     pivot = opencv_from_rig(model.subject.neutral.mean(0)).numpy()

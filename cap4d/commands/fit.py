@@ -43,7 +43,10 @@ def add(commands) -> None:
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted fit"
     )
     parser.add_argument(
-        "--ablate", choices=("unet", "mmdm"), help="leave a part out, to see what it is worth"
+        "--ablate",
+        choices=("unet", "remesh", "mmdm"),
+        help="leave a part out, to see what it is worth: the deformation network, the UV grid with it, or all "
+        "captures but the first",
     )
     add_reference_options(parser)
     parser.add_argument(
