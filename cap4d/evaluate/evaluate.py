@@ -69,9 +69,9 @@ def evaluate(
     player = Avatar.load(avatar, deformer=deformer, deformer_budget_ms=math.inf)
     person = Capture.load(capture)
     check_rig(person, player)
+    scene = Scene(player, person, chosen_views(person, views), size, pictures)
     found = metrics_available(weights or Weights(), bundle=player.bundle, only=only)
     metrics = {m.name: m for m in found if not isinstance(m, NotMeasured)}
-    scene = Scene(player, person, chosen_views(person, views), size, pictures)
     numbers, faces = measure(scene, metrics)
     facts = _facts(avatar, capture, scene) | {"seconds": round(time.monotonic() - started, 1)}
     return Evaluation(

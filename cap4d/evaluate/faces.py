@@ -57,10 +57,8 @@ class FaceFinder:
     def _detector(self):
         from cap4d.track.landmarks import Detector, without_native_chatter
 
-        with without_native_chatter():  # MediaPipe talks when its graphs first run, too
-            detector = self._stack.enter_context(Detector(video=False))
-            detector.landmarks(np.zeros((64, 64, 3), np.uint8))
-        return detector
+        self._stack.enter_context(without_native_chatter())  # to the end: the first face makes it talk, too
+        return self._stack.enter_context(Detector(video=False))
 
 
 def mediapipe_missing() -> str | None:
