@@ -72,3 +72,35 @@ def test_where_no_face_is_nothing_is_measured(frames, finder):
     pair = Pair(blank, frames[0], finder=finder)
     assert pair.faces.image is None and pair.faces.truth is not None
     assert KeypointDistance().measure(pair) is None
+
+
+def test_networks_get_the_face_upright_and_where_they_want_it(frames, finder):
+    """What each network is given: MediaPipe finds the eyes there where that network's training had them."""
+    from cap4d.evaluate.metrics.csim import PLACES, POINTS, aligned_face
+    from cap4d.evaluate.metrics.fan import face_square
+    from cap4d.evaluate.metrics.flame import face_box
+    from cap4d.evaluate.metrics.warp import cut
+
+    for image in (frames[0], np.ascontiguousarray(frames[0][::-1, ::-1])):  # the other stands on its head
+        points = finder.find(frames[0])
+        if image is not frames[0]:
+            points = [512, 512] - points
+        seen = finder.find(aligned_face(image, points))
+        five = np.stack([seen[list(group)].mean(0) for group in POINTS])
+        np.testing.assert_allclose(five, PLACES, atol=5)
+    points = finder.find(frames[0])
+    for affine, size, share in ((face_box(points), 224, 0.73), (face_square(points), 256, 0.49)):
+        seen = finder.find(cut(frames[0], affine, size))
+        assert np.ptp(seen[:, 0]) / size == pytest.approx(share, abs=0.08)
+
+
+def test_an_avatar_without_a_face_has_no_tracked_expression():
+    from tiny_bundle import tiny_bundle
+
+    from cap4d.evaluate.metrics.metric import NotMeasured
+    from cap4d.evaluate.metrics.registry import metrics_available
+    from cap4d.evaluate.metrics.weights import Weights
+
+    found = metrics_available(Weights(), bundle=tiny_bundle(network=False), only=["AED-mp", "APD-mp"])
+    assert all(isinstance(metric, NotMeasured) for metric in found)
+    assert "MediaPipe sees a face" in found[0].needs
