@@ -19,7 +19,7 @@ from cap4d.capture.capture import Capture, View
 from cap4d.capture.image import write_image
 from cap4d.errors import ArgumentError, DataError
 from cap4d.evaluate.evaluation import Evaluation
-from cap4d.evaluate.faces import FaceFinder
+from cap4d.evaluate.faces import AvertedFinder, FaceFinder, faces_camera
 from cap4d.evaluate.metrics.jod import JustObjectionableDifference
 from cap4d.evaluate.metrics.metric import Metric, NotMeasured
 from cap4d.evaluate.metrics.registry import metrics_available
@@ -51,7 +51,8 @@ def evaluate(
     """Measures an avatar on views of a capture, one after the other: memory does not grow with their number.
 
     Expressions, eyes, neck, jaw and head pose are the capture's, without corrections that a fit may have
-    learned. The person need not be the avatar's own: the identity of the capture has no say.
+    learned. The person need not be the avatar's own: the identity of the capture has no say. Faces are looked
+    for in views from at most 75 degrees aside.
 
     Args:
         avatar: `.cap4d` file.
@@ -117,7 +118,8 @@ class Scene:
             coverage = None if coverage is None else _shrunk(coverage[..., None], camera)[..., 0]
         image = picture.astype(np.float32) / 255
         key = (self.capture.path.resolve(), view.camera, view.frame, truth.shape)
-        return Pair(image, truth, coverage=coverage, finder=finder, truth_key=key)
+        looked = finder if faces_camera(camera) else AvertedFinder()
+        return Pair(image, truth, coverage=coverage, finder=looked, truth_key=key)
 
     def _file(self, view: View) -> Path:
         folder = self.pictures / view.camera
@@ -195,6 +197,7 @@ def _facts(avatar: Path, capture: Path, scene: Scene) -> dict[str, Any]:
         "deformer": scene.avatar.tier,
         "gaussians": len(scene.avatar.bundle),
         "sizes": [list(size) for size in sorted(sizes)],
+        "views_of_a_face": sum(faces_camera(scene.camera(view)) for view in scene.views),
         "background": f"white; the truth's taken away by its matte in {mattes} of {len(scene.views)} views",
         "masked": "full images; PSNR-fg alone is of the person's pixels",
         "command": sys.argv,

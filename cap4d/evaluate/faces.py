@@ -9,9 +9,11 @@ from functools import cached_property
 
 import numpy as np
 
+from cap4d.camera import OPENCV_FROM_RIG, Camera
 from cap4d.errors import ArgumentError
 
 NORMAL_SIDE = 512  # px of the larger side: the image that distances are said for
+MAX_ASIDE_DEG = 75.0  # from straight before the face: farther aside one of the eyes is hidden
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +77,26 @@ class FaceFinder:
         return self._stack.enter_context(Detector(video=False))
 
 
+class AvertedFinder:
+    """For views of a head from behind, in which MediaPipe now and then sees a face that is not there."""
+
+    def find(self, image: np.ndarray, *, key: Hashable = None) -> None:
+        """None."""
+
+
+def faces_camera(camera: Camera) -> bool:
+    """Whether a camera of the head-fixed world stands where it sees both eyes of the head."""
+    away = camera.position
+    forward = OPENCV_FROM_RIG @ [0.0, 0.0, 1.0]
+    return bool(forward @ away >= np.cos(np.radians(MAX_ASIDE_DEG)) * np.linalg.norm(away))
+
+
 def mediapipe_missing() -> str | None:
     """How to get MediaPipe where it is not installed; None where it is."""
     try:
-        from cap4d.track.landmarks import _import_mediapipe
+        from cap4d.track.landmarks import import_mediapipe
 
-        _import_mediapipe()
+        import_mediapipe()
     except ModuleNotFoundError as error:
         return f"the package {error.name} (pip install 'cap4d[track]')"
     except ArgumentError:

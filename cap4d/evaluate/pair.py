@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from cap4d.errors import ArgumentError
-from cap4d.evaluate.faces import FaceFinder, Faces
+from cap4d.evaluate.faces import AvertedFinder, FaceFinder, Faces
 
 MIN_SIDE = 16  # px; SSIM's window has 11, LPIPS halves its image four times
 
@@ -31,7 +31,7 @@ class Pair:
         truth: np.ndarray,
         *,
         coverage: np.ndarray | None = None,
-        finder: FaceFinder | None = None,
+        finder: FaceFinder | AvertedFinder | None = None,
         truth_key: Hashable = None,
     ) -> None:
         self.image, self.truth = _checked("image", image), _checked("truth", truth)

@@ -493,6 +493,21 @@ def test_jod_falls_with_harm_and_a_video_is_taken_in_order():
     assert taken == [0, 1, 2, 3]
 
 
+def test_jod_is_what_fovvideovdp_says_of_whole_arrays():
+    for module in ("pyfvvdp", "ffmpeg", "past", "imageio", "torch"):
+        pytest.importorskip(module, reason="needs the extra [jod]")
+    from cap4d.evaluate.metrics.jod import JustObjectionableDifference
+
+    metric = JustObjectionableDifference()
+    truth = np.stack([shifted(soft_noise(64), i) for i in range(4)])
+    film = np.clip(truth + 0.05, 0, 1)
+    whole = metric._predictor.predict(film, truth, dim_order="FHWC", frames_per_second=25)[0]
+    pairs = (Pair(image, right) for image, right in zip(film, truth, strict=True))
+    assert metric.measure_video(pairs, count=4, fps=25) == pytest.approx(float(whole), abs=1e-4)
+    still = metric._predictor.predict(film[0], truth[0], dim_order="HWC")[0]
+    assert metric.measure(Pair(film[0], truth[0])) == pytest.approx(float(still), abs=1e-4)
+
+
 # All of them
 
 

@@ -194,11 +194,12 @@ def test_the_report_is_json_and_says_what_was_not_measured(tmp_path, avatar_file
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     report = tmp_path / "report.json"
     words = ["evaluate", str(avatar_file), str(exact), "--cameras", "left", "--frames", "0:6:2"]
-    assert cli.main([*words, "--metrics", "PSNR,PSNR-fg,LPIPS,CSIM", "-o", str(report)]) == 0
+    assert cli.main([*words, "--metrics", "PSNR,PSNR-fg,LPIPS,CSIM,AED,APD", "-o", str(report)]) == 0
     printed = capsys.readouterr().out
     assert "PSNR        100.00 dB           3/3" in printed
     assert "PSNR-fg       none dB           0/3" in printed
-    assert "CSIM     not measured: needs an ArcFace network" in printed
+    assert "CSIM: not measured: needs an ArcFace network" in printed
+    assert printed.count("not measured: needs a regressor") == 1 and "AED, APD: not measured" in printed
 
     document = json.loads(report.read_text())
     assert document["views"] == [["left", 0], ["left", 2], ["left", 4]]
@@ -260,6 +261,23 @@ def test_films_are_measured_run_by_run(avatar_file, exact, monkeypatch):
     assert film.asked == [(3, 25.0, 3), (1, 25.0, 1), (2, 25.0, 2)]
     np.testing.assert_array_equal(found.values("JOD"), [7, 7, 7, 9, 8, 8])
     np.testing.assert_allclose(found.values("PSNR"), 100)
+
+
+def test_a_face_is_looked_for_where_there_is_one(avatar_file, avatar, tmp_path, monkeypatch):
+    from cap4d.evaluate.faces import FaceFinder
+
+    capture = write_capture(tmp_path / "cap", avatar)
+    with np.load(capture / "fit.npz") as arrays:
+        turned = np.zeros((FRAMES, 3), np.float32)
+        turned[:, 1] = np.radians([0, 60, 90, 180, -60, -90])
+        np.savez(tmp_path / "fit.npz", **{**arrays, "rot": turned})
+    (tmp_path / "fit.npz").replace(capture / "fit.npz")
+    looked = []
+    monkeypatch.setattr(FaceFinder, "_look", lambda self, image: looked.append(image))
+    views = [("left", t) for t in range(FRAMES)]
+    found = evaluate(avatar_file, capture, views=views, only=["AKD"])
+    assert len(looked) == 2 * 3
+    assert found.facts["views_of_a_face"] == 3
 
 
 def test_one_finder_looks_at_a_truth_once(avatar_file, exact, monkeypatch):
