@@ -116,7 +116,7 @@ def prepare(
         gaussians=preset.gaussians,
         per_face=preset.per_face,
         sh_degree=preset.sh_degree,
-        deformer_width=preset.deformer_width if ablate is None else None,
+        deformer_width=None if ablate in ("unet", "remesh") else preset.deformer_width,
         generator=generator,
     )
     pivot = opencv_from_rig(model.subject.neutral.mean(0)).numpy()
