@@ -23,6 +23,8 @@ COMMANDS = (
     ["rig", "show"],
     ["track"],
     ["fit"],
+    ["import"],
+    ["import", "official"],
     ["optimize"],
     ["render"],
     ["drive"],
