@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from cap4d.commands import import_gaussian_avatars
 from cap4d.commands.command import add_output, check_output, command
 
 OFFICIAL = """MODEL_DIR is a folder that the released CAP4D code wrote: chkpntN.pth, of which the newest is
@@ -22,7 +23,7 @@ def add(commands) -> None:
         more="Nothing in the files is executed. The avatar keeps the licences of its head model and its maker.",
     )
     kinds = parser.add_subparsers(title="avatars", required=True, metavar="KIND")
-    for kind in (_add_official(kinds),):
+    for kind in (_add_official(kinds), import_gaussian_avatars.add(kinds)):
         add_output(kind, "AVATAR.cap4d", "avatar to write; replaced if it exists")
 
 

@@ -25,6 +25,7 @@ COMMANDS = (
     ["fit"],
     ["import"],
     ["import", "official"],
+    ["import", "gaussian-avatars"],
     ["optimize"],
     ["render"],
     ["drive"],

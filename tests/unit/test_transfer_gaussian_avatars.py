@@ -12,10 +12,12 @@ import pytest
 pytest.importorskip("torch")
 
 import torch
+from cap4d.app.main import main as view
 from gaussian_avatars_files import Invented, chained_vertices, invent, write_ply
 
 from cap4d.bind import bind, triangle_frames
 from cap4d.bundle import Bundle, read_bundle, read_manifest
+from cap4d.cli import main
 from cap4d.errors import ArgumentError, DataError
 from cap4d.player.avatar import Avatar
 from cap4d.raster.reference import eval_sh
@@ -196,6 +198,24 @@ def test_harmonics_are_seen_from_the_mean_pose(bundle: Bundle, invented: Invente
     )
     here = eval_sh(torch.from_numpy(bundle.sh.astype(np.float64)), torch.from_numpy(world @ mean * FLIP), 3)
     np.testing.assert_allclose(here.numpy(), there.numpy(), atol=1e-5)
+
+
+def test_the_commands_import_and_play_it(
+    pickle: Path, invented: Invented, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    ply, params = invented.write(tmp_path)
+    files = [str(ply), "--params", str(params), "--flame", str(pickle)]
+    avatar = tmp_path / "a.cap4d"
+    assert main(["import", "gaussian-avatars", *files, "-o", str(avatar)]) == 0
+    assert main(["inspect", str(avatar)]) == 0
+    assert "the rig's own triangles, 5143 vertices, 10144 faces" in capsys.readouterr().out
+    shot = tmp_path / "shot_%04d.png"
+    line = f"{avatar} --headless --backend cpu --frames 2 --size 64x64 --out {shot}"
+    assert view(line.split()) == 0
+    assert len(list(tmp_path.glob("shot_*.png"))) == 2
+    ply.write_bytes(ply.read_bytes()[:-1])
+    assert main(["import", "gaussian-avatars", *files, "-o", str(tmp_path / "b.cap4d")]) == 1
+    assert "data: expected" in capsys.readouterr().err and not (tmp_path / "b.cap4d").exists()
 
 
 # What is refused ------------------------------------------------------------
