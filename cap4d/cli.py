@@ -11,7 +11,20 @@ import logging
 import sys
 from collections.abc import Sequence
 
-from cap4d.commands import bench, demo, drive, evaluate, fit, inspect, optimize, protocol, render, rig, track
+from cap4d.commands import (
+    bench,
+    demo,
+    drive,
+    evaluate,
+    fit,
+    import_,
+    inspect,
+    optimize,
+    protocol,
+    render,
+    rig,
+    track,
+)
 from cap4d.errors import exit_code
 from cap4d.parser import OneLineParser
 
@@ -43,7 +56,8 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--version", action="version", version=f"cap4d {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for room in (demo, rig, track, fit, optimize, render, drive, inspect, evaluate, protocol, bench):
+    rooms = (demo, rig, track, fit, import_, optimize, render, drive, inspect, evaluate, protocol, bench)
+    for room in rooms:
         room.add(commands)
     return parser
 
