@@ -28,6 +28,7 @@ COMMANDS = (
     ["optimize"],
     ["render"],
     ["drive"],
+    ["export"],
     ["inspect"],
     ["bench"],
 )
