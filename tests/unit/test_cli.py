@@ -30,6 +30,7 @@ COMMANDS = (
     ["optimize"],
     ["render"],
     ["drive"],
+    ["export"],
     ["inspect"],
     ["bench"],
 )
