@@ -6,6 +6,7 @@ namespace cap4d {
 void register_bind(pybind11::module_& m);
 void register_ceilings(pybind11::module_& m);
 void register_grid_surface(pybind11::module_& m);
+void register_lit_surface(pybind11::module_& m);
 void register_mesh(pybind11::module_& m);
 void register_render(pybind11::module_& m);
 void register_sort(pybind11::module_& m);

@@ -6,6 +6,7 @@ PYBIND11_MODULE(_core, m) {
   cap4d::register_bind(m);
   cap4d::register_ceilings(m);
   cap4d::register_grid_surface(m);
+  cap4d::register_lit_surface(m);
   cap4d::register_mesh(m);
   cap4d::register_render(m);
   cap4d::register_sort(m);
