@@ -50,6 +50,11 @@ def light_surface(
 def sort_by_depth(means: _F32, viewmat: _F32, threads: int = 0) -> NDArray[np.uint32]:
     """Order [N] of means [N, 3] near to far along viewmat [4, 4]; stable. Non-finite come last."""
 
+def draw_strands(xyz: _F32, rgba: _F32, widths: _F32, depth: _F32, softness: float) -> tuple[_F32, _F32]:
+    """K strands of P points: xyz [K, P, 3] px, px, depth; rgba [K, P, 4]; widths [K, P] px, in front of depth
+    [H, W] -> premultiplied rgb [H, W, 3] and what is still seen behind [H, W].
+    """
+
 def bind(
     vertices: _F32, faces: _I32, means: _F32, quats: _F32, log_scales: _F32, binding: _I32, threads: int = 0
 ) -> tuple[_F32, _F32, _F32]:

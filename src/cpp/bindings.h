@@ -11,5 +11,6 @@ void register_mesh(pybind11::module_& m);
 void register_render(pybind11::module_& m);
 void register_sort(pybind11::module_& m);
 void register_splatter(pybind11::module_& m);
+void register_strands(pybind11::module_& m);
 void register_unet(pybind11::module_& m);
 }  // namespace cap4d

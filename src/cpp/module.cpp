@@ -11,5 +11,6 @@ PYBIND11_MODULE(_core, m) {
   cap4d::register_render(m);
   cap4d::register_sort(m);
   cap4d::register_splatter(m);
+  cap4d::register_strands(m);
   cap4d::register_unet(m);
 }
