@@ -21,6 +21,7 @@ COMMANDS = (
     ["rig", "import", "ict"],
     ["rig", "import", "builtin"],
     ["rig", "show"],
+    ["synth"],
     ["track"],
     ["fit"],
     ["evaluate"],
