@@ -41,8 +41,9 @@ KEYS = ("shape", "base_rot", "deform_net", "gaussians")
 N_GAUSSIAN_FIELDS = 14
 N_FACES = 28_120  # of the released grid (fact 18)
 MAX_WIDTH = 256
-DEFAULT_FOCAL, DEFAULT_SIZE, DEFAULT_DISTANCE = 2604.75, 512, 1.469153  # px, px, m: fact 47's sequences
+DEFAULT_SIZE, DEFAULT_DISTANCE = 512, 1.469153  # px and m of the released sample sequences (fact 47)
 DEFAULT_CENTRE = 257.3, 269.5  # px, the same
+DEFAULT_FOCAL = 2200.0  # px; theirs is 2605, which cuts hair
 SMALLEST_NORM = 1e-6  # of a quaternion
 
 
@@ -80,8 +81,8 @@ def import_official(
         model: The folder that it wrote, or one `chkpntN.pth`.
         flame: FLAME 2023 without a jaw, the pickle.
         assets: Folder of the released assets.
-        clip: A FlowFace sequence for the idle clip and the default view; None: an invented one, and the view
-            of the released sample sequences.
+        clip: A FlowFace sequence for the idle clip and the default view; None: an invented one, and a view
+            like that of the released sample sequences.
     Raises:
         DataError: Something is not sound, or of another rig.
     """
@@ -179,7 +180,7 @@ def avatar_model(official: OfficialAvatar, rig: HeadRig, grid: UvGrid, *, source
 
 
 def default_view() -> Camera:
-    """The view that the released sample sequences are seen in, head-fixed world (fact 47)."""
+    """About the view that the released sample sequences are seen in, head-fixed world (fact 47)."""
     (cx, cy), size = DEFAULT_CENTRE, DEFAULT_SIZE
     K = np.array([[DEFAULT_FOCAL, 0, cx], [0, DEFAULT_FOCAL, cy], [0, 0, 1]])
     viewmat = head_fixed(np.eye(4), np.zeros(3), np.array([0, 0, -DEFAULT_DISTANCE]))
