@@ -25,6 +25,8 @@ COMMANDS = (
     ["track"],
     ["fit"],
     ["evaluate"],
+    ["protocol"],
+    ["protocol", "self-reenactment"],
     ["import"],
     ["import", "official"],
     ["import", "gaussian-avatars"],
