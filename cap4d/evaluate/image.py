@@ -53,7 +53,7 @@ def _blur(planes: np.ndarray) -> np.ndarray:
 
 
 def _blur_columns(planes: np.ndarray) -> np.ndarray:
-    """[C, H, W] -> [C, H - 10, W], in blocks of rows: products of matrices, twice as quick as one per window."""
+    """[C, H, W] -> [C, H - 10, W], by blocks of rows: matrix products, twice as quick as one per window."""
     band = _band()
     channels, height, width = planes.shape
     out = np.empty((channels, height - SSIM_WINDOW + 1, width))

@@ -424,6 +424,30 @@ def test_a_network_that_does_not_fit_is_refused(tmp_path, outputs, size, field):
         IdentitySimilarity(path).measure(Pair(image, image, finder=GivenFaces(points, points)))
 
 
+def test_weights_beside_a_network_are_read_and_others_are_not(tmp_path):
+    """As torch.onnx exports networks with much in them: `face.onnx` and `face.bin`."""
+    import onnx
+
+    folder = tmp_path / "user"
+    folder.mkdir()
+    path = write_network(folder / "face.onnx", {"id": 512}, size=112)
+    points, image = points_at(csim.PLACES), soft_noise(112)
+    pairs = [Pair(image, 1 - image, finder=GivenFaces(points, points)) for _ in range(2)]
+    whole = IdentitySimilarity(path).measure(pairs[0])
+    beside = {"save_as_external_data": True, "location": "face.bin", "size_threshold": 0}
+    onnx.save(onnx.load(path), path, **beside)
+    assert IdentitySimilarity(path).measure(pairs[1]) == pytest.approx(whole, abs=1e-6)
+
+    (folder / "face.bin").rename(tmp_path / "face.bin")
+    model = onnx.load(path, load_external_data=False)
+    for entry in model.graph.initializer[0].external_data:
+        if entry.key == "location":
+            entry.value = "../face.bin"
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(DataError, match="network: expected ONNX that loads"):
+        IdentitySimilarity(path)
+
+
 def test_a_regressor_with_other_outputs_is_refused(tmp_path):
     path = write_network(tmp_path / "flame.onnx", {"shape": 100, "light": 27}, size=224)
     with pytest.raises(DataError, match=r"236 numbers, or expression and pose, found shape, light"):

@@ -264,6 +264,7 @@ def test_films_are_measured_run_by_run(avatar_file, exact, monkeypatch):
 
 
 def test_a_face_is_looked_for_where_there_is_one(avatar_file, avatar, tmp_path, monkeypatch):
+    pytest.importorskip("mediapipe", reason="needs mediapipe")
     from cap4d.evaluate.faces import FaceFinder
 
     capture = write_capture(tmp_path / "cap", avatar)
@@ -282,6 +283,7 @@ def test_a_face_is_looked_for_where_there_is_one(avatar_file, avatar, tmp_path, 
 
 def test_one_finder_looks_at_a_truth_once(avatar_file, exact, monkeypatch):
     """Two evaluations on a capture look at two pictures of the avatar and one truth."""
+    pytest.importorskip("mediapipe", reason="needs mediapipe")
     from cap4d.evaluate.faces import FaceFinder
 
     looked = []

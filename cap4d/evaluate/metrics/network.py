@@ -31,9 +31,12 @@ class Network:
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 4
         options.add_session_config_entry("session.force_spinning_stop", "1")
-        data = _read(path)
+        _check_file(path)
         try:
-            self._session = onnxruntime.InferenceSession(data, options, providers=[CPU], enable_fallback=0)
+            # By its path: large networks keep weights in files beside them; onnxruntime takes no others.
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=[CPU], enable_fallback=0
+            )
         except Exception as error:  # onnxruntime raises a type for every one of its codes
             found = str(error)[:200]
             raise DataError(path, "network", expected="ONNX that loads", found=found) from None
@@ -81,11 +84,11 @@ class Network:
         return inputs[0].name
 
 
-def _read(path: Path) -> bytes:
+def _check_file(path: Path) -> None:
     try:
-        size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise DataError(path, "size", expected=f"at most {MOST_BYTES} bytes", found=size)
-        return path.read_bytes()
+        with open(path, "rb"):
+            size = path.stat().st_size
     except OSError as error:
         raise ArgumentError(f"{path}: cannot be read: {error.strerror}") from error
+    if size > MOST_BYTES:
+        raise DataError(path, "size", expected=f"at most {MOST_BYTES} bytes", found=size)
