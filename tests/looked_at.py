@@ -15,7 +15,7 @@ class GivenFaces:
     def __init__(self, *points: np.ndarray | None) -> None:
         self._points = list(points)
 
-    def find(self, _: np.ndarray) -> np.ndarray | None:
+    def find(self, _: np.ndarray, *, key: object = None) -> np.ndarray | None:
         return self._points.pop(0)
 
 

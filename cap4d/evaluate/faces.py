@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,11 +38,13 @@ class Faces:
 class FaceFinder:
     """MediaPipe, started with the first image. Use as a context manager.
 
-    Every image is looked at afresh, so that neither order nor neighbours change what is found.
+    Every image is looked at afresh, so that neither order nor neighbours change what is found. One finder can
+    serve several evaluations on a capture: it remembers the truths' faces.
     """
 
     def __init__(self) -> None:
         self._stack = ExitStack()
+        self._known: dict[Hashable, np.ndarray | None] = {}
 
     def __enter__(self) -> FaceFinder:
         return self
@@ -49,8 +52,19 @@ class FaceFinder:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def find(self, image: np.ndarray) -> np.ndarray | None:
-        """Landmarks float64[478, 2] px (pixel centres at .5) in float[H, W, 3] in [0, 1], or None."""
+    def find(self, image: np.ndarray, *, key: Hashable = None) -> np.ndarray | None:
+        """Landmarks float64[478, 2] px (pixel centres at .5) in float[H, W, 3] in [0, 1], or None.
+
+        Args:
+            key: What the image is known by, to be looked at once only; None: look.
+        """
+        if key is None:
+            return self._look(image)
+        if key not in self._known:
+            self._known[key] = self._look(image)
+        return self._known[key]
+
+    def _look(self, image: np.ndarray) -> np.ndarray | None:
         return self._detector.landmarks(np.rint(image * 255).astype(np.uint8))
 
     @cached_property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from cap4d.evaluate.metrics import csim, flame, lpips  # noqa: E402
 from cap4d.evaluate.metrics.blink import BlinkError  # noqa: E402
 from cap4d.evaluate.metrics.csim import IdentitySimilarity, aligned_face  # noqa: E402
 from cap4d.evaluate.metrics.eyes import EYES, IRISES, aspect_ratios, iris_diameters  # noqa: E402
+from cap4d.evaluate.metrics.fan import FanDistance, peaks  # noqa: E402
 from cap4d.evaluate.metrics.flame import ExpressionDistance, FlameRegressor, PoseDistance  # noqa: E402
 from cap4d.evaluate.metrics.gaze import GazeError  # noqa: E402
 from cap4d.evaluate.metrics.keypoints import IBUG_68, KeypointDistance  # noqa: E402
@@ -255,6 +258,60 @@ def test_one_solution_serves_both_and_none_is_none(solver):
     assert solver(faced_pair(None, seen())) is None
     far = np.zeros((478, 2))
     assert solver(faced_pair(far, seen(), size=480)) is None  # all in one point: no face
+
+
+# AKD-fan
+
+
+def test_fans_points_are_where_its_heatmaps_are_highest(tmp_path):
+    """A network whose heatmaps all are the image itself, averaged over 4 px: one bright spot is every point."""
+    metric = FanDistance(write_heatmaps(tmp_path / "fan.onnx"))
+    landmarks = np.array([[100.0, 100.0], [200.0, 240.0]])  # the box is all that is looked at
+    truth, image = spot(150, 160), spot(162, 155)
+    pair = Pair(image, truth, finder=GivenFaces(landmarks, landmarks))
+    cell = 200 * 240 / 195 / 64  # px of a heatmap's cell
+    assert metric.measure(pair) == pytest.approx(2 * np.hypot(12, 5), abs=2 * cell)
+    assert metric.measure(Pair(truth, truth, finder=GivenFaces(landmarks, landmarks))) == 0
+    assert metric.measure(Pair(truth, truth, finder=GivenFaces(None, landmarks))) is None
+
+
+def test_a_network_with_other_heatmaps_is_refused(tmp_path):
+    path = write_heatmaps(tmp_path / "fan.onnx", points=98)
+    landmarks = np.array([[100.0, 100.0], [200.0, 240.0]])
+    with pytest.raises(DataError, match=r"expected float32\[1, 68, 64, 64\], found \[1, 98, 64, 64\]"):
+        FanDistance(path).measure(Pair(spot(9, 9), spot(9, 9), finder=GivenFaces(landmarks, landmarks)))
+
+
+def test_a_peak_leans_to_its_higher_neighbour():
+    maps = np.zeros((3, 8, 8), np.float32)
+    maps[:, 4, 5] = 1
+    maps[1, 4, 6], maps[1, 3, 5] = 0.5, 0.2
+    maps[2] = 0
+    maps[2, 0, 7] = 1  # in the corner, with neighbours on one side only
+    np.testing.assert_allclose(peaks(maps), [[5.5, 4.5], [5.75, 4.25], [7.75, 0.25]])
+
+
+def spot(x: float, y: float) -> np.ndarray:
+    """A bright spot in a dark picture of 256."""
+    rows, columns = np.indices((256, 256)) + 0.5
+    bright = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 5.0**2))
+    return np.repeat(bright[..., None], 3, -1).astype(np.float32)
+
+
+def write_heatmaps(path: Path, *, points: int = 68) -> Path:
+    import onnx
+    from onnx import numpy_helper
+    from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
+
+    kernel = numpy_helper.from_array(np.full((points, 3, 4, 4), 1 / 48, np.float32), "kernel")
+    node = make_node("Conv", ["input", "kernel"], ["maps"], strides=[4, 4])
+    values = [
+        make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
+        for name, shape in (("input", [1, 3, 256, 256]), ("maps", [1, points, 64, 64]))
+    ]
+    graph = make_graph([node], "fan", values[:1], values[1:], [kernel])
+    onnx.save(make_model(graph, opset_imports=[make_opsetid("", 18)], ir_version=8), path)
+    return path
 
 
 # CSIM

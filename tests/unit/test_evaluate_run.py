@@ -185,7 +185,9 @@ def test_pictures_are_kept_where_asked(tmp_path, avatar_file, exact):
     evaluate(avatar_file, exact, views=[("right", 3)], only=PIXELS, pictures=tmp_path / "pictures")
     drawn = read_image(tmp_path / "pictures" / "right" / "00003.png")
     np.testing.assert_array_equal(drawn, read_image(exact / "images" / "right" / "00003.png"))
-    assert len(list((tmp_path / "pictures").rglob("*.png"))) == 1
+    sheet = read_image(tmp_path / "pictures" / "sheet.png")
+    np.testing.assert_array_equal(sheet, np.concatenate([drawn, drawn, np.zeros_like(drawn)], 1))
+    assert len(list((tmp_path / "pictures").rglob("*.png"))) == 2
 
 
 def test_the_report_is_json_and_says_what_was_not_measured(tmp_path, avatar_file, exact, capsys, monkeypatch):
@@ -258,3 +260,18 @@ def test_films_are_measured_run_by_run(avatar_file, exact, monkeypatch):
     assert film.asked == [(3, 25.0, 3), (1, 25.0, 1), (2, 25.0, 2)]
     np.testing.assert_array_equal(found.values("JOD"), [7, 7, 7, 9, 8, 8])
     np.testing.assert_allclose(found.values("PSNR"), 100)
+
+
+def test_one_finder_looks_at_a_truth_once(avatar_file, exact, monkeypatch):
+    """Two evaluations on a capture look at two pictures of the avatar and one truth."""
+    from cap4d.evaluate.faces import FaceFinder
+
+    looked = []
+    monkeypatch.setattr(FaceFinder, "_look", lambda self, image: looked.append(image))
+    with FaceFinder() as finder:
+        for _ in range(2):
+            found = evaluate(avatar_file, exact, views=[("left", 1)], only=["AKD"], finder=finder)
+            assert found.mean("AKD") is None
+    assert len(looked) == 3
+    counts = found.document()["faces"]
+    assert counts == {"views": 1, "in_picture": 0, "in_truth": 0, "in_both": 0, "lost_by_avatar": 0}

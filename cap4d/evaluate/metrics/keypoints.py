@@ -26,7 +26,8 @@ class KeypointDistance:
     takes the 68 points from FAN (Bulat & Tzimiropoulos 2017). These are the same points as found by
     MediaPipe 0.10.21, the mean over four wobbled copies of each image. None unless a face is found in both.
 
-    MediaPipe's own noise is 0.6 px: what frames of a talking head, moved as a whole, differ by from that move.
+    MediaPipe's own noise is 0.6 px: the mean distance of a talking head's points from where a move of the
+    whole frame puts them.
     """
 
     name, unit, decimals = "AKD", "px at 512", 3
