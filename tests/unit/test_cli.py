@@ -23,6 +23,7 @@ COMMANDS = (
     ["rig", "show"],
     ["track"],
     ["fit"],
+    ["evaluate"],
     ["optimize"],
     ["render"],
     ["drive"],
