@@ -11,7 +11,7 @@ import logging
 import sys
 from collections.abc import Sequence
 
-from cap4d.commands import bench, demo, drive, evaluate, fit, inspect, optimize, render, rig, track
+from cap4d.commands import bench, demo, drive, evaluate, fit, inspect, optimize, protocol, render, rig, track
 from cap4d.errors import exit_code
 from cap4d.parser import OneLineParser
 
@@ -43,7 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--version", action="version", version=f"cap4d {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for room in (demo, rig, track, fit, evaluate, optimize, render, drive, inspect, bench):
+    for room in (demo, rig, track, fit, evaluate, protocol, optimize, render, drive, inspect, bench):
         room.add(commands)
     return parser
 

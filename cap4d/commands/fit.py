@@ -45,8 +45,8 @@ def add(commands) -> None:
     parser.add_argument(
         "--ablate",
         choices=("unet", "remesh", "mmdm"),
-        help="leave a part out, to see what it is worth: the deformation network, the UV grid with it, or all "
-        "captures but the first",
+        help="leave a part out, to see what it is worth: the deformation network, the UV grid with it, or "
+        "all captures but the first",
     )
     add_reference_options(parser)
     parser.add_argument(

@@ -24,6 +24,8 @@ COMMANDS = (
     ["track"],
     ["fit"],
     ["evaluate"],
+    ["protocol"],
+    ["protocol", "self-reenactment"],
     ["optimize"],
     ["render"],
     ["drive"],
