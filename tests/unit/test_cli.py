@@ -26,6 +26,7 @@ COMMANDS = (
     ["evaluate"],
     ["protocol"],
     ["protocol", "self-reenactment"],
+    ["protocol", "cross-reenactment"],
     ["optimize"],
     ["render"],
     ["drive"],

@@ -11,6 +11,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ from cap4d.avatar.presets import Preset
 from cap4d.avatar.references import choose_held_out, choose_references
 from cap4d.avatar.views import check_rig
 from cap4d.capture.capture import Capture
-from cap4d.errors import ArgumentError, DataError
-from cap4d.evaluate.protocols.cell import Cell, Judge, Result
-from cap4d.evaluate.protocols.cells import Failure, run_cells
+from cap4d.errors import ArgumentError
+from cap4d.evaluate.protocols.cell import Cell, Judge, Result, run_cell
+from cap4d.evaluate.protocols.cells import Failure, check_whole, run_cells
 from cap4d.evaluate.protocols.layout import (
     METHODS,
     gain_table,
@@ -91,14 +92,12 @@ def self_reenactment(
     def note(results: list[Result], failures: list[Failure]) -> None:
         write_tables(output, protocol, results, failures)
 
-    results, failures = run_cells(cells, rig, output / "cells", judge, judged_by, after=note)
+    folder = output / "cells"
+    jobs = [(cell.name, partial(run_cell, cell, rig, folder, judge, judged_by)) for cell in cells]
+    results, failures = run_cells(jobs, after=note)
     if results:
         write_page(output, results)
-    if failures:
-        lines = "; ".join(f"{f.cell.name}: {f.reason}" for f in failures)
-        raise DataError(
-            output / "report.json", "cells", expected=f"all of {len(cells)}", found=f"failed: {lines}"
-        )
+    check_whole(output / "report.json", len(cells), failures)
     return results
 
 
@@ -187,7 +186,7 @@ def document(protocol: Protocol, results: Sequence[Result], failures: Sequence[F
         "protocol": "self-reenactment",
         "settings": _settings(protocol),
         "cells": [_cell_document(r) for r in results],
-        "failed": [{"cell": f.cell.name, "reason": f.reason} for f in failures],
+        "failed": [{"cell": f.name, "reason": f.reason} for f in failures],
         "gains": {t: {g.metric: g.document() for g in gains} for t, gains in gains_of(results).items()},
         "not_measured": {name: needs for r in results for name, needs in r.missing.items()},
     }
@@ -196,7 +195,7 @@ def document(protocol: Protocol, results: Sequence[Result], failures: Sequence[F
 def markdown(protocol: Protocol, results: Sequence[Result], failures: Sequence[Failure]) -> list[str]:
     """The tables, and in words how they were made."""
     lines = ["# Self-reenactment", "", *_how(protocol, results), ""]
-    lines += [f"- failed: {f.cell.name}: {f.reason}" for f in failures] + [""] * bool(failures)
+    lines += [f"- failed: {f.name}: {f.reason}" for f in failures] + [""] * bool(failures)
     if not results:
         return lines
     lines += ["## Mean over identities", "", *mean_table(results)]
