@@ -60,7 +60,7 @@ def _add_self(kinds) -> None:
         default="none",
         metavar="A,B,...",
         help="methods: none (all of ours), and what is left out: unet, lpips, remesh (GaussianAvatars), mmdm "
-        "(generated views) (default: none)",
+        "(all generated views) (default: none)",
     )
     add_fit_options(parser)
     parser.add_argument(
@@ -132,6 +132,12 @@ def run_cross(arguments: argparse.Namespace) -> None:
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """What shapes every fit."""
     parser.add_argument("--preset", default="debug", metavar="P", help="of every fit (default: debug)")
+    parser.add_argument(
+        "--recipe",
+        default="auto",
+        choices=("auto", "released", "paper", "short"),
+        help="as of cap4d fit (default: auto)",
+    )
     parser.add_argument("--steps", type=int, metavar="N", help="fit for so many steps, not the preset's")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of every fit (default: 0)")
 
@@ -166,6 +172,7 @@ def run_self(arguments: argparse.Namespace) -> None:
         generated=arguments.generated,
         seed=arguments.seed,
         reference_seed=arguments.reference_seed,
+        lpips_weights=arguments.lpips_weights,
     )
     self_reenactment(
         arguments.captures, arguments.rig, arguments.output, protocol, judge=judge, judged_by=judged_by
@@ -177,9 +184,10 @@ def _preset(arguments: argparse.Namespace):
     from dataclasses import replace
 
     from cap4d.avatar.presets import preset_named
+    from cap4d.commands.fit import recipe_of
     from cap4d.errors import ArgumentError
 
-    preset = preset_named(arguments.preset)
+    preset = preset_named(arguments.preset, recipe_of(arguments.recipe))
     if arguments.steps is None:
         return preset
     if arguments.steps < 1:

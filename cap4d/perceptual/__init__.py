@@ -1,1 +1,1 @@
-"""Networks trained on photographs, which judge how alike two pictures look; the weights come from the user."""
+"""Networks trained on photographs that judge how alike two pictures look; weights come from the user."""

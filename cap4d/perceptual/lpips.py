@@ -22,7 +22,8 @@ MOST_BYTES = 1 << 30  # torchvision's file has 528 MB
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
 LINEAR_URL = "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/vgg.pth"
 LPIPS_NEEDS = (
-    f"LPIPS needs VGG16's weights ({TRUNK_FILE} from {TRUNK_URL}) and its own ({LINEAR_FILE} from {LINEAR_URL}), "
+    f"LPIPS needs VGG16's weights ({TRUNK_FILE} from {TRUNK_URL}) and its own ({LINEAR_FILE} from "
+    f"{LINEAR_URL}), "
     "both in torch hub's cache (~/.cache/torch/hub/checkpoints) or in the folder given as --lpips-weights"
 )
 

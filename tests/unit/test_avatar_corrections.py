@@ -30,7 +30,7 @@ def test_they_start_at_what_was_tracked(capture, corrections):
     torch.testing.assert_close(c.pose.expr, torch.from_numpy(capture.expr[5]))
     torch.testing.assert_close(c.rigid[0], torch.eye(3))
     assert c.rigid[1].abs().max() < 1e-7
-    assert not corrections.penalty().detach().any()
+    assert not corrections.penalty(0).detach().any()
 
 
 def test_a_held_out_frame_gets_its_neighbours_correction(corrections):

@@ -39,6 +39,7 @@ class Cell:
         preset, seed: Of the fit.
         views: (camera, frame) that are looked at.
         size: Pixels of the larger side that they are looked at with.
+        lpips_weights: For fits with an LPIPS term (see `fit`).
     """
 
     identity: str
@@ -51,6 +52,7 @@ class Cell:
     seed: int
     views: tuple[tuple[str, int], ...]
     size: int
+    lpips_weights: Path | None = None
 
     @property
     def method(self) -> str:
@@ -128,6 +130,7 @@ def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
         resume=True,
         ablate=cell.ablate,
         seed=cell.seed,
+        lpips_weights=cell.lpips_weights,
         references=cell.references,
         hold_out=cell.hold_out,
     )
@@ -135,7 +138,8 @@ def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
 
 def fit_digest(cell: Cell, rig: Path) -> str:
     """Changes with whatever changes the avatar: images, tracking, rig, settings, this package's version."""
-    parts = [__version__, repr(cell.preset), cell.ablate, cell.seed, cell.references, cell.hold_out]
+    shaped = cell.ablate, cell.seed, cell.references, cell.hold_out, str(cell.lpips_weights)
+    parts = [__version__, repr(cell.preset), *shaped]
     digest = hashlib.sha256(repr(parts).encode())
     add_files(digest, [rig, cell.capture / "fit.npz"])
     add_files(digest, files_of(cell.capture, cell.references))

@@ -54,6 +54,7 @@ class Protocol:
         generated: A folder with captures made from the references, as `<person>/<count>`; None: the fits have
             their references alone.
         seed, reference_seed: Of the fits, and of the choice of references.
+        lpips_weights: For fits with an LPIPS term (see `fit`).
     """
 
     preset: Preset
@@ -65,6 +66,7 @@ class Protocol:
     generated: Path | None = None
     seed: int = 0
     reference_seed: int = 0
+    lpips_weights: Path | None = None
 
 
 def self_reenactment(
@@ -142,6 +144,7 @@ def _of(path: Path, name: str, rig: HeadRig, protocol: Protocol) -> list[Cell]:
             seed=protocol.seed,
             views=views,
             size=protocol.size or protocol.preset.image_size,
+            lpips_weights=protocol.lpips_weights,
         )
         for count in protocol.references
         for method in protocol.methods
@@ -211,7 +214,8 @@ def markdown(protocol: Protocol, results: Sequence[Result], failures: Sequence[F
 
 def _how(protocol: Protocol, results: Sequence[Result]) -> list[str]:
     p = protocol.preset
-    lines = [f"Every fit: preset {p.name}, {p.iterations} steps at {p.image_size} px, seed {protocol.seed}."]
+    what = f"recipe {p.recipe}, preset {p.name}, {p.iterations} steps at {p.image_size} px"
+    lines = [f"Every fit: {what}, seed {protocol.seed}."]
     if protocol.generated is None:
         lines.append("Fits have their references alone: there are no generated views in any row.")
     if results:
@@ -228,7 +232,13 @@ def _settings(protocol: Protocol) -> dict[str, Any]:
         for k in ("references", "methods", "hold_out", "frames", "seed", "reference_seed")
     }
     p = protocol.preset
-    return plain | {"preset": p.name, "iterations": p.iterations, "image_size": p.image_size, "all": repr(p)}
+    return plain | {
+        "recipe": p.recipe,
+        "preset": p.name,
+        "iterations": p.iterations,
+        "image_size": p.image_size,
+        "all": repr(p),
+    }
 
 
 def _cell_document(r: Result) -> dict[str, Any]:
