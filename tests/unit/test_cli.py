@@ -30,6 +30,7 @@ COMMANDS = (
     ["import"],
     ["import", "official"],
     ["import", "gaussian-avatars"],
+    ["protocol", "cross-reenactment"],
     ["optimize"],
     ["render"],
     ["drive"],

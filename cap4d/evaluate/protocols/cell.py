@@ -39,6 +39,7 @@ class Cell:
         preset, seed: Of the fit.
         views: (camera, frame) that are looked at.
         size: Pixels of the larger side that they are looked at with.
+        lpips_weights: For fits with an LPIPS term (see `fit`).
     """
 
     identity: str
@@ -51,6 +52,7 @@ class Cell:
     seed: int
     views: tuple[tuple[str, int], ...]
     size: int
+    lpips_weights: Path | None = None
 
     @property
     def method(self) -> str:
@@ -110,7 +112,7 @@ def run_cell(cell: Cell, rig: Path, folder: Path, judge: Judge, judged_by: str) 
     if not verdict.exists():
         shutil.rmtree(own / "pictures", ignore_errors=True)
         values, missing = judge(avatar, cell.capture, cell.views, cell.size, own / "pictures")
-        write_verdict(verdict, cell, values, missing)
+        write_verdict(verdict, cell.name, cell.views, values, missing)
     values, missing = read_verdict(verdict, len(cell.views))
     return Result(cell, own, values, missing, _read(numbers))
 
@@ -128,6 +130,7 @@ def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
         resume=True,
         ablate=cell.ablate,
         seed=cell.seed,
+        lpips_weights=cell.lpips_weights,
         references=cell.references,
         hold_out=cell.hold_out,
     )
@@ -135,13 +138,14 @@ def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
 
 def fit_digest(cell: Cell, rig: Path) -> str:
     """Changes with whatever changes the avatar: images, tracking, rig, settings, this package's version."""
-    parts = [__version__, repr(cell.preset), cell.ablate, cell.seed, cell.references, cell.hold_out]
+    shaped = cell.ablate, cell.seed, cell.references, cell.hold_out, str(cell.lpips_weights)
+    parts = [__version__, repr(cell.preset), *shaped]
     digest = hashlib.sha256(repr(parts).encode())
-    _add_files(digest, [rig, cell.capture / "fit.npz"])
-    _add_files(digest, _files(cell.capture, cell.references))
+    add_files(digest, [rig, cell.capture / "fit.npz"])
+    add_files(digest, files_of(cell.capture, cell.references))
     for capture in cell.generated:
         found = Capture.load(capture)
-        _add_files(digest, [capture / "fit.npz"])
+        add_files(digest, [capture / "fit.npz"])
         # Hundreds of images: their names and sizes have to do.
         digest.update(repr([(v.camera, v.frame, v.image.stat().st_size) for v in found.views]).encode())
     return digest.hexdigest()[:DIGITS]
@@ -150,18 +154,18 @@ def fit_digest(cell: Cell, rig: Path) -> str:
 def judge_digest(cell: Cell, judged_by: str) -> str:
     """Changes with whatever changes the verdict on an avatar."""
     digest = hashlib.sha256(repr([__version__, cell.views, cell.size, judged_by]).encode())
-    _add_files(digest, [cell.capture / "fit.npz", *_files(cell.capture, cell.views)])
+    add_files(digest, [cell.capture / "fit.npz", *files_of(cell.capture, cell.views)])
     return digest.hexdigest()[:DIGITS]
 
 
 def write_verdict(
-    path: Path, cell: Cell, values: dict[str, Sequence[float]], missing: dict[str, str]
+    path: Path, name: str, views: Views, values: dict[str, Sequence[float]], missing: dict[str, str]
 ) -> None:
     """Numbers that are not finite (a face that was not found) are written as null."""
     plain = {n: [float(x) if np.isfinite(x) else None for x in v] for n, v in values.items()}
     document = {
-        "cell": cell.name,
-        "views": [list(v) for v in cell.views],
+        "cell": name,
+        "views": [list(v) for v in views],
         "values": plain,
         "missing": missing,
     }
@@ -185,13 +189,15 @@ def read_verdict(path: Path, views: int) -> tuple[dict[str, np.ndarray], dict[st
     return values, missing
 
 
-def _files(capture: Path, pairs: Views) -> list[Path]:
+def files_of(capture: Path, pairs: Views) -> list[Path]:
+    """Images and mattes of views."""
     by_name = {(v.camera, v.frame): v for v in Capture.load(capture).views}
     views = [by_name[tuple(pair)] for pair in pairs]
     return [file for v in views for file in (v.image, v.matte) if file is not None]
 
 
-def _add_files(digest, files: Sequence[Path]) -> None:
+def add_files(digest, files: Sequence[Path]) -> None:
+    """Feeds what is in the files to a hash."""
     for file in files:
         digest.update(hashlib.sha256(file.read_bytes()).digest())
 

@@ -1,4 +1,4 @@
-"""Works through the cells of a protocol: those done are kept, one that fails does not lose the others."""
+"""Works through the cells of a protocol: one that fails does not lose the others."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from cap4d.errors import Cap4dError
-from cap4d.evaluate.protocols.cell import Cell, Judge, Result, run_cell
+from cap4d.errors import Cap4dError, DataError
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
 QUICK = 1.0  # s; a cell that took less was found done and says nothing of the pace
 
 
@@ -20,43 +21,45 @@ QUICK = 1.0  # s; a cell that took less was found done and says nothing of the p
 class Failure:
     """A cell that came to nothing, and why, in one line."""
 
-    cell: Cell
+    name: str
     reason: str
 
 
 def run_cells(
-    cells: Sequence[Cell],
-    rig: Path,
-    folder: Path,
-    judge: Judge,
-    judged_by: str,
-    *,
-    after: Callable[[list[Result], list[Failure]], None],
-) -> tuple[list[Result], list[Failure]]:
-    """Runs the cells in order.
+    jobs: Sequence[tuple[str, Callable[[], T]]], *, after: Callable[[list[T], list[Failure]], None]
+) -> tuple[list[T], list[Failure]]:
+    """Does the jobs in order.
 
     Args:
-        folder: Of all cells.
-        judge, judged_by: See `run_cell`.
+        jobs: Each cell's name, and what makes it or finds it made.
         after: Called after every cell with all that is known so far.
     """
-    results: list[Result] = []
+    results: list[T] = []
     failures: list[Failure] = []
     times: list[float] = []
-    for i, cell in enumerate(cells):
-        log.info("cell %d/%d: %s%s", i + 1, len(cells), cell.name, _left(times, len(cells) - i))
+    for i, (name, job) in enumerate(jobs):
+        log.info("cell %d/%d: %s%s", i + 1, len(jobs), name, _left(times, len(jobs) - i))
         begun = time.monotonic()
         try:
-            results.append(run_cell(cell, rig, folder, judge, judged_by))
+            results.append(job())
         except Exception as error:  # hours of other cells are at stake, whatever went wrong in this one
-            failures.append(Failure(cell, _line(error)))
-            log.error("%s failed: %s", cell.name, failures[-1].reason)
-            if not isinstance(error, Cap4dError):
-                log.debug("its traceback", exc_info=True)
+            failures.append(Failure(name, _line(error)))
+            log.error("%s failed: %s", name, failures[-1].reason)
+            log.debug("its traceback", exc_info=True)
         seconds = time.monotonic() - begun
         times += [seconds] if seconds > QUICK else []
         after(results, failures)
     return results, failures
+
+
+def check_whole(report: Path, count: int, failures: Sequence[Failure]) -> None:
+    """
+    Raises:
+        DataError: Some of `count` cells failed; the report has the others.
+    """
+    if failures:
+        found = "failed: " + "; ".join(f"{f.name}: {f.reason}" for f in failures)
+        raise DataError(report, "cells", expected=f"all of {count}", found=found)
 
 
 def _left(times: Sequence[float], cells: int) -> str:

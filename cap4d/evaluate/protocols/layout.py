@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -87,6 +87,18 @@ def gain_table(results: Sequence[Result]) -> list[str]:
     for title, gains in gains_of(results).items():
         by_metric = {g.metric: g for g in gains}
         lines.append(_line([title, *(_gain(by_metric.get(m)) for m in metrics)]))
+    return [*lines, ""]
+
+
+def table(
+    names: Sequence[str],
+    metrics: Sequence[str],
+    rows: Iterable[tuple[Sequence[object], Mapping[str, float | None], object]],
+    last: str,
+) -> list[str]:
+    """A table whose rows are what they are called, a number per metric, and one thing more."""
+    lines = _head([*names, *map(_titled, metrics), last])
+    lines += [_line([*own, *(_number(m, numbers[m]) for m in metrics), end]) for own, numbers, end in rows]
     return [*lines, ""]
 
 

@@ -16,7 +16,7 @@ from cap4d.capture.image import write_image
 from cap4d.evaluate.protocols.cell import Result
 from cap4d.evaluate.protocols.layout import METHODS, of_row, rows_of
 from cap4d.evaluate.protocols.markup import as_html
-from cap4d.evaluate.protocols.sheet import draw_sheet
+from cap4d.evaluate.protocols.titled_sheet import draw_sheet
 
 VIEWS = 3  # per identity
 TRUTH = "truth"

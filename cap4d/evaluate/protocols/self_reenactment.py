@@ -11,6 +11,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ from cap4d.avatar.presets import Preset
 from cap4d.avatar.references import choose_held_out, choose_references
 from cap4d.avatar.views import check_rig
 from cap4d.capture.capture import Capture
-from cap4d.errors import ArgumentError, DataError
-from cap4d.evaluate.protocols.cell import Cell, Judge, Result
-from cap4d.evaluate.protocols.cells import Failure, run_cells
+from cap4d.errors import ArgumentError
+from cap4d.evaluate.protocols.cell import Cell, Judge, Result, run_cell
+from cap4d.evaluate.protocols.cells import Failure, check_whole, run_cells
 from cap4d.evaluate.protocols.layout import (
     METHODS,
     gain_table,
@@ -53,6 +54,7 @@ class Protocol:
         generated: A folder with captures made from the references, as `<person>/<count>`; None: the fits have
             their references alone.
         seed, reference_seed: Of the fits, and of the choice of references.
+        lpips_weights: For fits with an LPIPS term (see `fit`).
     """
 
     preset: Preset
@@ -64,6 +66,7 @@ class Protocol:
     generated: Path | None = None
     seed: int = 0
     reference_seed: int = 0
+    lpips_weights: Path | None = None
 
 
 def self_reenactment(
@@ -91,14 +94,12 @@ def self_reenactment(
     def note(results: list[Result], failures: list[Failure]) -> None:
         write_tables(output, protocol, results, failures)
 
-    results, failures = run_cells(cells, rig, output / "cells", judge, judged_by, after=note)
+    folder = output / "cells"
+    jobs = [(cell.name, partial(run_cell, cell, rig, folder, judge, judged_by)) for cell in cells]
+    results, failures = run_cells(jobs, after=note)
     if results:
         write_page(output, results)
-    if failures:
-        lines = "; ".join(f"{f.cell.name}: {f.reason}" for f in failures)
-        raise DataError(
-            output / "report.json", "cells", expected=f"all of {len(cells)}", found=f"failed: {lines}"
-        )
+    check_whole(output / "report.json", len(cells), failures)
     return results
 
 
@@ -143,6 +144,7 @@ def _of(path: Path, name: str, rig: HeadRig, protocol: Protocol) -> list[Cell]:
             seed=protocol.seed,
             views=views,
             size=protocol.size or protocol.preset.image_size,
+            lpips_weights=protocol.lpips_weights,
         )
         for count in protocol.references
         for method in protocol.methods
@@ -187,7 +189,7 @@ def document(protocol: Protocol, results: Sequence[Result], failures: Sequence[F
         "protocol": "self-reenactment",
         "settings": _settings(protocol),
         "cells": [_cell_document(r) for r in results],
-        "failed": [{"cell": f.cell.name, "reason": f.reason} for f in failures],
+        "failed": [{"cell": f.name, "reason": f.reason} for f in failures],
         "gains": {t: {g.metric: g.document() for g in gains} for t, gains in gains_of(results).items()},
         "not_measured": {name: needs for r in results for name, needs in r.missing.items()},
     }
@@ -196,7 +198,7 @@ def document(protocol: Protocol, results: Sequence[Result], failures: Sequence[F
 def markdown(protocol: Protocol, results: Sequence[Result], failures: Sequence[Failure]) -> list[str]:
     """The tables, and in words how they were made."""
     lines = ["# Self-reenactment", "", *_how(protocol, results), ""]
-    lines += [f"- failed: {f.cell.name}: {f.reason}" for f in failures] + [""] * bool(failures)
+    lines += [f"- failed: {f.name}: {f.reason}" for f in failures] + [""] * bool(failures)
     if not results:
         return lines
     lines += ["## Mean over identities", "", *mean_table(results)]
@@ -212,7 +214,8 @@ def markdown(protocol: Protocol, results: Sequence[Result], failures: Sequence[F
 
 def _how(protocol: Protocol, results: Sequence[Result]) -> list[str]:
     p = protocol.preset
-    lines = [f"Every fit: preset {p.name}, {p.iterations} steps at {p.image_size} px, seed {protocol.seed}."]
+    what = f"recipe {p.recipe}, preset {p.name}, {p.iterations} steps at {p.image_size} px"
+    lines = [f"Every fit: {what}, seed {protocol.seed}."]
     if protocol.generated is None:
         lines.append("Fits have their references alone: there are no generated views in any row.")
     if results:
@@ -229,7 +232,13 @@ def _settings(protocol: Protocol) -> dict[str, Any]:
         for k in ("references", "methods", "hold_out", "frames", "seed", "reference_seed")
     }
     p = protocol.preset
-    return plain | {"preset": p.name, "iterations": p.iterations, "image_size": p.image_size, "all": repr(p)}
+    return plain | {
+        "recipe": p.recipe,
+        "preset": p.name,
+        "iterations": p.iterations,
+        "image_size": p.image_size,
+        "all": repr(p),
+    }
 
 
 def _cell_document(r: Result) -> dict[str, Any]:
