@@ -16,6 +16,7 @@ from cap4d.commands import (
     demo,
     drive,
     evaluate,
+    export,
     fit,
     import_,
     inspect,
@@ -23,6 +24,7 @@ from cap4d.commands import (
     protocol,
     render,
     rig,
+    synth,
     track,
 )
 from cap4d.errors import exit_code
@@ -56,8 +58,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--version", action="version", version=f"cap4d {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    rooms = (demo, rig, track, fit, import_, optimize, render, drive, inspect, evaluate, protocol, bench)
-    for room in rooms:
+    making = (demo, rig, track, synth, fit, import_, optimize)
+    using = (render, drive, export, inspect, evaluate, protocol, bench)
+    for room in making + using:
         room.add(commands)
     return parser
 

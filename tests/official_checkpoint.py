@@ -64,7 +64,7 @@ def official_network(*, width: int, size: int, generator: torch.Generator) -> De
     """A U-Net whose answers are of some millimetres, as a fitted one's are."""
     network = Deformer(np.ones((size, size), bool), width=width, generator=generator)
     last = network.model.model[-1]
-    nn.init.normal_(last.weight, std=0.1 / width**0.5, generator=generator)
+    nn.init.normal_(last.weight, std=0.04 / width**0.5, generator=generator)
     nn.init.normal_(last.bias, std=0.1, generator=generator)
     return network
 

@@ -43,7 +43,9 @@ def _add_views(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "full", "fp16", "int8", "linear", "off"),
         help="as of cap4d render (default: auto, the most exact)",
     )
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="folder for the avatar's pictures")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="folder for the avatar's pictures and a sheet.png"
+    )
 
 
 def _add_weights(parser: argparse.ArgumentParser) -> None:
@@ -51,6 +53,7 @@ def _add_weights(parser: argparse.ArgumentParser) -> None:
         "--lpips-weights", type=Path, metavar="DIR", help="LPIPS's two files (default: torch hub's cache)"
     )
     parser.add_argument("--arcface", type=Path, metavar="FILE.onnx", help="ArcFace, for CSIM")
+    parser.add_argument("--fan", type=Path, metavar="FILE.onnx", help="FAN, for AKD-fan")
     parser.add_argument("--flame-regressor", type=Path, metavar="FILE.onnx", help="DECA or SMIRK: AED, APD")
 
 
@@ -73,7 +76,10 @@ def run_evaluate(arguments: argparse.Namespace) -> None:
         arguments.capture,
         views=views,
         weights=Weights(
-            lpips=arguments.lpips_weights, arcface=arguments.arcface, flame=arguments.flame_regressor
+            lpips=arguments.lpips_weights,
+            arcface=arguments.arcface,
+            fan=arguments.fan,
+            flame=arguments.flame_regressor,
         ),
         only=_names(arguments.metrics),
         size=arguments.size,

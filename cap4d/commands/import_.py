@@ -20,7 +20,7 @@ def add(commands) -> None:
         None,
         "make a .cap4d file of an avatar that was made elsewhere",
         "cap4d import official MODEL_DIR --assets data/assets/flame --flame flame2023_no_jaw.pkl -o me.cap4d",
-        more="Nothing in the files is executed. The avatar keeps the licences of its head model and its maker.",
+        more="Nothing in the files is executed. The avatar keeps the licences of its model and its maker.",
     )
     kinds = parser.add_subparsers(title="avatars", required=True, metavar="KIND")
     for kind in (_add_official(kinds), import_gaussian_avatars.add(kinds)):

@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,19 +19,20 @@ from cap4d.capture.capture import Capture, View
 from cap4d.capture.image import write_image
 from cap4d.errors import ArgumentError, DataError
 from cap4d.evaluate.evaluation import Evaluation
-from cap4d.evaluate.faces import FaceFinder
+from cap4d.evaluate.faces import AvertedFinder, FaceFinder, faces_camera
 from cap4d.evaluate.metrics.jod import JustObjectionableDifference
 from cap4d.evaluate.metrics.metric import Metric, NotMeasured
 from cap4d.evaluate.metrics.registry import metrics_available
 from cap4d.evaluate.metrics.weights import Weights
 from cap4d.evaluate.pair import Pair
+from cap4d.evaluate.sheet import Sheet
 from cap4d.evaluate.views import chosen_views, runs, sized_camera
 from cap4d.player.avatar import Avatar, Tier
 from cap4d.rig.flame import RELEASED_RIG
 from cap4d.track.progress import progress
 
 WHITE = (1.0, 1.0, 1.0)
-NEED_FACES = ("CSIM", "AED", "APD", "AKD", "gaze", "blink", "AED-mp", "APD-mp")
+NEED_FACES = ("CSIM", "AED", "APD", "AKD", "gaze", "blink", "AKD-fan", "AED-mp", "APD-mp")
 PACKAGES = ("cap4d", "numpy", "onnxruntime", "torch", "mediapipe", "pyfvvdp")
 
 
@@ -44,11 +46,13 @@ def evaluate(
     size: int | None = None,
     deformer: Tier = "auto",
     pictures: Path | None = None,
+    finder: FaceFinder | None = None,
 ) -> Evaluation:
     """Measures an avatar on views of a capture, one after the other: memory does not grow with their number.
 
     Expressions, eyes, neck, jaw and head pose are the capture's, without corrections that a fit may have
-    learned. The person need not be the avatar's own: the identity of the capture has no say.
+    learned. The person need not be the avatar's own: the identity of the capture has no say. Faces are looked
+    for in views from at most 75 degrees aside.
 
     Args:
         avatar: `.cap4d` file.
@@ -58,7 +62,9 @@ def evaluate(
         only: Names of metrics; None: all.
         size: Of the larger side, px: truth is averaged down to it, never up; None: as the capture is.
         deformer: As of `Avatar`; `auto` is the most exact.
-        pictures: Folder for what the avatar looks like, `<camera>/<frame:05d>.png`; made if need be.
+        pictures: Folder for what the avatar looks like, `<camera>/<frame:05d>.png`, and some of the views
+            side by side with the truth, `sheet.png`; made if need be.
+        finder: One that is open, to serve several evaluations; None: one of its own.
     Raises:
         ArgumentError: An unknown view or metric, an impossible size, or a missing file of `weights`.
         DataError: A file is not sound, or the capture is of another rig.
@@ -69,10 +75,11 @@ def evaluate(
     player = Avatar.load(avatar, deformer=deformer, deformer_budget_ms=math.inf)
     person = Capture.load(capture)
     check_rig(person, player)
+    scene = Scene(player, person, chosen_views(person, views), size, pictures)
     found = metrics_available(weights or Weights(), bundle=player.bundle, only=only)
     metrics = {m.name: m for m in found if not isinstance(m, NotMeasured)}
-    scene = Scene(player, person, chosen_views(person, views), size, pictures)
-    numbers, faces = measure(scene, metrics)
+    with FaceFinder() if finder is None else nullcontext(finder) as open_finder:
+        numbers, faces = measure(scene, metrics, open_finder)
     facts = _facts(avatar, capture, scene) | {"seconds": round(time.monotonic() - started, 1)}
     return Evaluation(
         views=tuple((view.camera, view.frame) for view in scene.views),
@@ -98,7 +105,7 @@ class Scene:
         """In the head-fixed world, at the size that is asked for."""
         return sized_camera(self.capture.head_camera(view), self.size)
 
-    def pair(self, view: View, finder: FaceFinder | None) -> Pair:
+    def pair(self, view: View, finder: FaceFinder) -> Pair:
         """The avatar's picture (of 8 bits) and the truth of a view."""
         camera = self.camera(view)
         picture = self.avatar.draw(self.capture.clip().frame(view.frame), camera, background=WHITE)[..., :3]
@@ -109,7 +116,10 @@ class Scene:
         if truth.shape[:2] != picture.shape[:2]:
             truth = _shrunk(truth, camera)
             coverage = None if coverage is None else _shrunk(coverage[..., None], camera)[..., 0]
-        return Pair(picture.astype(np.float32) / 255, truth, coverage=coverage, finder=finder)
+        image = picture.astype(np.float32) / 255
+        key = (self.capture.path.resolve(), view.camera, view.frame, truth.shape)
+        looked = finder if faces_camera(camera) else AvertedFinder()
+        return Pair(image, truth, coverage=coverage, finder=looked, truth_key=key)
 
     def _file(self, view: View) -> Path:
         folder = self.pictures / view.camera
@@ -117,7 +127,9 @@ class Scene:
         return folder / f"{view.frame:05d}.png"
 
 
-def measure(scene: Scene, metrics: dict[str, Metric]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def measure(
+    scene: Scene, metrics: dict[str, Metric], finder: FaceFinder
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Every metric on every view.
 
     Returns:
@@ -129,6 +141,7 @@ def measure(scene: Scene, metrics: dict[str, Metric]) -> tuple[dict[str, np.ndar
     numbers = {name: np.full(len(scene.views), np.nan) for name in metrics}
     faces = np.zeros((len(scene.views), 2), bool)
     looks = any(name in NEED_FACES for name in stills)
+    sheet = None if scene.pictures is None else Sheet(len(scene.views))
 
     def pairs() -> Iterator[Pair]:
         for k, view in enumerate(progress(scene.views, "measuring", len(scene.views))):
@@ -138,18 +151,20 @@ def measure(scene: Scene, metrics: dict[str, Metric]) -> tuple[dict[str, np.ndar
                 numbers[name][k] = np.nan if value is None else value
             if looks:
                 faces[k] = [face is not None for face in (pair.faces.image, pair.faces.truth)]
+            if sheet is not None:
+                sheet.add(k, pair)
             yield pair
+        if sheet is not None:
+            sheet.write(scene.pictures / "sheet.png")
 
-    with FaceFinder() as finder:
-        stream = pairs()
-        for run in runs(scene.views, [scene.camera(view) for view in scene.views]):
-            if film is not None:
-                fps = scene.capture.fps
-                numbers[film.name][run] = film.measure_video(stream, count=len(run), fps=fps)
-            else:
-                for _ in run:
-                    next(stream)
-        next(stream, None)  # lets the progress end
+    stream = pairs()
+    for run in runs(scene.views, [scene.camera(view) for view in scene.views]):
+        if film is not None:
+            numbers[film.name][run] = film.measure_video(stream, count=len(run), fps=scene.capture.fps)
+        else:
+            for _ in run:
+                next(stream)
+    next(stream, None)  # the last pair is dealt with when the next one is asked for
     return numbers, faces
 
 
@@ -182,6 +197,7 @@ def _facts(avatar: Path, capture: Path, scene: Scene) -> dict[str, Any]:
         "deformer": scene.avatar.tier,
         "gaussians": len(scene.avatar.bundle),
         "sizes": [list(size) for size in sorted(sizes)],
+        "views_of_a_face": sum(faces_camera(scene.camera(view)) for view in scene.views),
         "background": f"white; the truth's taken away by its matte in {mattes} of {len(scene.views)} views",
         "masked": "full images; PSNR-fg alone is of the person's pixels",
         "command": sys.argv,

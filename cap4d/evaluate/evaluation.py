@@ -71,7 +71,10 @@ class Evaluation:
         """A line per metric, for people."""
         lines = [f"{'metric':<8} {'mean':>9} {'':<9} {'views':>9}  "]
         lines += [self._line(name) for name in self.metrics]
-        lines += [f"{name:<8} not measured: needs {absent.needs}" for name, absent in self.missing.items()]
+        needs = dict.fromkeys(absent.needs for absent in self.missing.values())
+        for need in needs:
+            names = ", ".join(name for name, absent in self.missing.items() if absent.needs == need)
+            lines.append(f"{names}: not measured: needs {need}")
         return "\n".join(line.rstrip() for line in lines)
 
     def _line(self, name: str) -> str:

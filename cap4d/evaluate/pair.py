@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from functools import cached_property
 
 import numpy as np
 
 from cap4d.errors import ArgumentError
-from cap4d.evaluate.faces import FaceFinder, Faces
+from cap4d.evaluate.faces import AvertedFinder, FaceFinder, Faces
 
 MIN_SIDE = 16  # px; SSIM's window has 11, LPIPS halves its image four times
 
@@ -19,6 +20,7 @@ class Pair:
         image, truth: float32[H, W, 3] sRGB in [0, 1], both on the same background.
         coverage: float32[H, W] the person's matte, or None.
         finder: What finds faces; None: metrics that need faces cannot be asked.
+        truth_key: What the truth is known by, for the finder to look at it once only; see `FaceFinder.find`.
     Raises:
         ArgumentError: The two are not finite images in [0, 1] of one size of at least 16 px a side.
     """
@@ -29,7 +31,8 @@ class Pair:
         truth: np.ndarray,
         *,
         coverage: np.ndarray | None = None,
-        finder: FaceFinder | None = None,
+        finder: FaceFinder | AvertedFinder | None = None,
+        truth_key: Hashable = None,
     ) -> None:
         self.image, self.truth = _checked("image", image), _checked("truth", truth)
         if self.image.shape != self.truth.shape:
@@ -38,14 +41,16 @@ class Pair:
         if coverage is not None and coverage.shape != self.truth.shape[:2]:
             expected, found = list(self.truth.shape[:2]), list(coverage.shape)
             raise ArgumentError(f"coverage: expected {expected} as the truth, got {found}")
-        self.coverage, self._finder = coverage, finder
+        self.coverage, self._finder, self._truth_key = coverage, finder, truth_key
 
     @cached_property
     def faces(self) -> Faces:
         """The face in both images."""
         if self._finder is None:
             raise ArgumentError("faces: expected a pair with a face finder, got one without")
-        return Faces(self._finder.find(self.image), self._finder.find(self.truth), self.truth.shape[:2])
+        image = self._finder.find(self.image)
+        truth = self._finder.find(self.truth, key=self._truth_key)
+        return Faces(image, truth, self.truth.shape[:2])
 
 
 def _checked(name: str, image: np.ndarray) -> np.ndarray:

@@ -88,7 +88,8 @@ def parse_frames(text: str) -> slice:
         numbers = []
     if len(parts) == 1 and numbers and numbers[0] is not None and numbers[0] >= 0:
         return slice(numbers[0], numbers[0] + 1)
-    if not 2 <= len(numbers) <= 3 or (len(numbers) == 3 and (numbers[2] or 1) < 1):
+    step = numbers[2] if len(numbers) == 3 else None
+    if not 2 <= len(numbers) <= 3 or (step is not None and step < 1):
         raise ArgumentError(f"frames: expected FIRST:END or FIRST:END:STEP, got {text}")
     return slice(*numbers)
 

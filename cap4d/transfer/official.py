@@ -86,7 +86,7 @@ def import_official(
         DataError: Something is not sound, or of another rig.
     """
     checkpoint = newest_checkpoint(Path(model))
-    performance = None if clip is None else _read_clip(clip)
+    performance = None if clip is None else read_clip(clip)
     official = read_official(checkpoint)
     log.info("%s: %s", checkpoint, _summary(official))
     rig = released_rig(flame, assets)
@@ -94,8 +94,8 @@ def import_official(
     if len(grid.faces) != N_FACES:
         raise DataError(assets, "template", expected=f"a grid of {N_FACES} faces", found=len(grid.faces))
     idle = invented_clip(rig) if performance is None else idle_clip(performance, rig)
-    camera = default_view() if performance is None else _view_of(clip, performance)
-    log.info("making the deformers (a minute or so)")
+    camera = default_view() if performance is None else view_of(clip, performance)
+    log.info("making its deformers")
     bundle = bundle_of(
         avatar_model(official, rig, grid, source=checkpoint),
         rig=rig,
@@ -186,7 +186,12 @@ def default_view() -> Camera:
     return Camera(K, viewmat, size, size)
 
 
-def _read_clip(path: Path) -> Clip:
+def read_clip(path: Path) -> Clip:
+    """A FlowFace sequence of the released rig.
+
+    Raises:
+        DataError: It is not sound, or of another rig.
+    """
     clip = read_sequence(path)
     if clip.rig_name != RELEASED_RIG:
         raise DataError(path, "rig_name", expected=repr(RELEASED_RIG), found=repr(clip.rig_name[:64]))
@@ -195,7 +200,7 @@ def _read_clip(path: Path) -> Clip:
     return clip
 
 
-def _view_of(path: Path, clip: Clip) -> Camera:
+def view_of(path: Path, clip: Clip) -> Camera:
     """The clip's first camera as it stands to the head on average, or the default view without one."""
     if clip.rot is None or "extr" not in read_npz(path, names=("extr",)):
         return default_view()

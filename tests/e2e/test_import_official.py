@@ -9,6 +9,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,7 @@ def read_template(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             uv.append([float(x) for x in rest[:2]])
         elif word == "f":
             corners = [[int(n) - 1 for n in corner.split("/")[:2]] for corner in rest]
-            for a, b in zip(corners[1:], corners[2:], strict=False):
+            for a, b in pairwise(corners[1:]):
                 faces.append([corners[0][0], a[0], b[0]])
                 uv_faces.append([corners[0][1], a[1], b[1]])
     return np.array(uv), np.array(faces), np.array(uv_faces)

@@ -329,3 +329,65 @@ def test_whatever_is_flipped_is_refused_or_harmless(tmp_path):
         except DataError:
             refused += 1
     assert refused > 40
+
+
+def test_tensors_that_were_on_a_gpu_are_read(tmp_path):
+    data = tensor_pickle(b"K\x02\x85", b"K\x01\x85").replace(
+        b"ctorch\nFloat", b"ctorch.cuda\nFloat"
+    ).replace(b"X\x03\0\0\0cpu", b"X\x06\0\0\0cuda:0")  # fmt: skip
+    path = zipped(tmp_path / "x.pth", {"data.pkl": data, "data/0": struct.pack("<4f", 1, 2, 3, 4)})
+    with TorchFile(path) as file:
+        np.testing.assert_array_equal(file.array("tensor", file.content), [1, 2])
+
+
+def test_a_clip_gives_the_default_view(tmp_path):
+    from cap4d.transfer.official import read_clip, view_of
+
+    still = np.zeros((3, 3), np.float32)
+    arrays = {
+        "expr": np.zeros((3, 65), np.float32),
+        "eye_rot": still,
+        "rot": still + np.float32([0, 0.3, 0]),
+        "tra": still + np.float32([0, 0.1, -1.2]),
+    }
+    camera = {"extr": np.eye(4)[None], "resolutions": np.array([[400, 300]])}
+    camera |= {name: np.full((1, 1), value) for name, value in zip(
+        ("fx", "fy", "cx", "cy"), (900.0, 910.0, 150.0, 200.0), strict=True)}  # fmt: skip
+    np.savez(tmp_path / "fit.npz", **arrays, **camera)
+    view = view_of(tmp_path / "fit.npz", read_clip(tmp_path / "fit.npz"))
+    assert (view.width, view.height) == (300, 400) and view.K[1, 1] == 910
+    np.testing.assert_allclose(view.viewmat[:3, 3], [0, -0.1, 1.2], atol=1e-6)
+    assert view.viewmat[0, 0] == pytest.approx(np.cos(0.3))
+    np.savez(tmp_path / "no_camera.npz", **arrays)
+    still_view = view_of(tmp_path / "no_camera.npz", read_clip(tmp_path / "no_camera.npz"))
+    assert still_view.viewmat[2, 3] == pytest.approx(1.469, abs=1e-3)
+    np.savez(tmp_path / "other.npz", **arrays, rig_name=np.array("ict"))
+    with pytest.raises(DataError, match="rig_name: expected 'flame2023_no_jaw', found 'ict'"):
+        read_clip(tmp_path / "other.npz")
+    np.savez(tmp_path / "short.npz", **{**arrays, "expr": np.zeros((3, 64), np.float32)})
+    with pytest.raises(DataError, match=r"expr: expected \[\*, 65\], found \[3, 64\]"):
+        read_clip(tmp_path / "short.npz")
+
+
+def test_layers_that_do_not_fit_are_named(tmp_path, state):
+    from tiny_avatar import tiny_rig
+
+    from cap4d.rig.grid import build_grid
+    from cap4d.transfer.official import avatar_model
+
+    rig = tiny_rig()
+    grid = build_grid(rig, 16)
+    content, iteration = official_state(gaussians=len(grid.faces), faces=len(grid.faces), width=2, size=16)
+    content["shape"] = torch.zeros(150)
+    for change, message in (
+        ({"model.model.3.bias": torch.zeros(4)}, r"deform_net model\.model\.3\.bias: expected \[3\], found"),
+        ({"model.model.9.bias": torch.zeros(4)}, r"deform_net: expected .* found also model\.model\.9\.bias"),
+    ):
+        net = {**content["deform_net"], **change}
+        path = saved(tmp_path / "x.pth", ({**content, "deform_net": net}, iteration))
+        with pytest.raises(DataError, match=message):
+            avatar_model(read_official(path, faces=len(grid.faces)), rig, grid, source=path)
+    path = saved(tmp_path / "x.pth", (content, iteration))
+    model = avatar_model(read_official(path, faces=len(grid.faces)), rig, grid, source=path)
+    for name, value in model.deformer.named_parameters():
+        torch.testing.assert_close(value, content["deform_net"][name], rtol=0, atol=0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from cap4d.errors import DataError
 from cap4d.evaluate.faces import mediapipe_missing
+from cap4d.evaluate.metrics.keypoints import IBUG_68
 from cap4d.evaluate.metrics.metric import Better, NotMeasured
 from cap4d.evaluate.metrics.network import Network
 from cap4d.evaluate.metrics.warp import cut
@@ -16,7 +17,7 @@ from cap4d.evaluate.metrics.weights import Weights
 from cap4d.evaluate.pair import Pair
 
 SIZE = 224
-MARGIN = 1.25  # DECA's crop: this times the size of the landmarks' box
+MARGIN = 1.1 * 1.25  # DECA's crop: this times the size of the box of 68 points
 DECA_LENGTH = 236  # shape 100, texture 50, expression 50, pose 6, camera 3, light 27
 DECA_EXPRESSION, DECA_POSE = slice(150, 200), slice(200, 206)
 EXPRESSION_NAMES, POSE_NAMES = ("expression_params", "expression", "exp"), ("pose_params", "pose")
@@ -70,7 +71,10 @@ class FlameRegressor:
 
 
 def face_box(points: np.ndarray) -> np.ndarray:
-    """[2, 3] map of the square around landmarks [P, 2] onto the network's input, as in DECA's datasets.py."""
+    """[2, 3] map of the square around landmarks [478, 2] onto the network's input, as in DECA's datasets.py
+    for 68 points, whose box ends at the brows.
+    """
+    points = points[list(IBUG_68)]
     low, high = points.min(0), points.max(0)
     side = MARGIN * (high - low).sum() / 2  # width and height, averaged
     scale = SIZE / max(side, 1e-6)

@@ -19,7 +19,8 @@ class GazeError:
     corner and eyeball differ by cancels, being the same in both. The truth's irises give the scale of both
     images. Eyes that are shut in one of them (aspect ratio under 0.15) do not count; None if no eye does.
 
-    The eyeball model is that of Wood & Bulling 2014, "EyeTab"; not in CAP4D's paper.
+    The eyeball model is that of Wood & Bulling 2014, "EyeTab"; not in CAP4D's paper. MediaPipe's own noise is
+    0.7 degrees (frames of a talking head against the same frames moved by 4 to 15 px).
     """
 
     name, unit, decimals = "gaze", "deg", 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from importlib.util import find_spec
 
@@ -33,10 +34,13 @@ class JustObjectionableDifference:
     better: Better = "higher"
 
     def __init__(self) -> None:
-        import pyfvvdp
         import torch
 
-        self._predictor = pyfvvdp.fvvdp(display_name=DISPLAY, quiet=True, device=torch.device("cpu"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # it takes parts of SciPy from old places
+            import pyfvvdp
+
+            self._predictor = pyfvvdp.fvvdp(display_name=DISPLAY, quiet=True, device=torch.device("cpu"))
 
     def measure(self, pair: Pair) -> float:
         """Of a still."""

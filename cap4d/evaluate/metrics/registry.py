@@ -7,7 +7,7 @@ from collections.abc import Collection
 from cap4d.bundle.bundle import Bundle
 from cap4d.errors import ArgumentError
 from cap4d.evaluate.faces import mediapipe_missing
-from cap4d.evaluate.metrics import csim, flame, jod, lpips, tracked
+from cap4d.evaluate.metrics import csim, fan, flame, jod, lpips, tracked
 from cap4d.evaluate.metrics.blink import BlinkError
 from cap4d.evaluate.metrics.gaze import GazeError
 from cap4d.evaluate.metrics.keypoints import KeypointDistance
@@ -17,7 +17,7 @@ from cap4d.evaluate.metrics.ssim import Ssim
 from cap4d.evaluate.metrics.weights import Weights
 
 PAPER_METRICS = ("PSNR", "LPIPS", "SSIM", "CSIM", "JOD", "AED", "APD", "AKD")
-METRIC_NAMES = (*PAPER_METRICS, "gaze", "blink", "AED-mp", "APD-mp", "PSNR-fg")
+METRIC_NAMES = (*PAPER_METRICS, "gaze", "blink", "AKD-fan", "AED-mp", "APD-mp", "PSNR-fg")
 LANDMARK_METRICS = (KeypointDistance, GazeError, BlinkError)
 TRACKED_METRICS = ("AED-mp", "APD-mp")
 
@@ -46,7 +46,7 @@ def metrics_available(
 def _found(weights: Weights, bundle: Bundle | None, wanted: frozenset[str]) -> list[Metric | NotMeasured]:
     """At least those wanted; what is not wanted is not loaded where that would cost something."""
     metrics: list[Metric | NotMeasured] = [Psnr(), Ssim(), PersonPsnr(), *_of_landmarks()]
-    finders = {"LPIPS": lpips.find, "CSIM": csim.find, "JOD": jod.find}
+    finders = {"LPIPS": lpips.find, "CSIM": csim.find, "JOD": jod.find, "AKD-fan": fan.find}
     metrics += [find(weights) for name, find in finders.items() if name in wanted]
     if wanted & {"AED", "APD"}:
         metrics += flame.find(weights)

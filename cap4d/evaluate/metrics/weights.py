@@ -13,7 +13,7 @@ class Weights:
     Args:
         lpips: Folder with both files of LPIPS; None: the usual caches are looked into.
         arcface: ArcFace as ONNX, for CSIM.
-        fan: FAN as ONNX, for AKD with its 68 points.
+        fan: FAN as ONNX, for AKD-fan.
         flame: A regressor of FLAME's parameters (DECA, SMIRK) as ONNX, for AED and APD.
     """
 
