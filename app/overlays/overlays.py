@@ -124,7 +124,7 @@ class Overlays:
         if Overlay.UV in showing:
             self._surface.draw("overlay_uv", uniforms={"grid_size": float(self._surface.grid_size)})
         if Overlay.MESH in showing:
-            self._surface.draw("overlay_mesh")
+            self._surface.draw("overlay_wire" if self.avatar.bundle.grid.is_mesh else "overlay_mesh")
         return self._surface.end()
 
     def _draw_deformation(self, surface: SurfacePass) -> None:
