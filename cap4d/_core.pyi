@@ -19,8 +19,41 @@ def rasterize_mesh(
 ) -> tuple[_I32, _F64]:
     """xyz [V, 3] px, px, depth -> triangle per pixel [H, W] (-1: none) and its barycentrics [H, W, 3]."""
 
+def gradient_noise(points: _F32, seed: int) -> _F32:
+    """points [N, 3] in units of the lattice -> Perlin's noise [N] in about [-1, 1]."""
+
+def cellular_noise(points: _F32, seed: int) -> tuple[_F32, _F32]:
+    """points [N, 3] in units of a cell -> distance [N] to the nearest feature, and a number [N] of its own."""
+
+def light_surface(
+    face: _I32,
+    bary: _F64,
+    faces: _I32,
+    uv_faces: _I32,
+    positions: _F32,
+    normals: _F32,
+    soft: _F32,
+    depths: _F32,
+    open: _F32,
+    visible: _F32,
+    uvs: _F32,
+    texture: _F32,
+    directions: _F32,
+    colors: _F32,
+    sky: _F32,
+    ground: _F32,
+    up: _F32,
+    eye: _F32,
+) -> tuple[_F32, _F32]:
+    """What rasterize_mesh saw, in light: linear rgb [H, W, 3] and depth [H, W]; see lit_surface.h."""
+
 def sort_by_depth(means: _F32, viewmat: _F32, threads: int = 0) -> NDArray[np.uint32]:
     """Order [N] of means [N, 3] near to far along viewmat [4, 4]; stable. Non-finite come last."""
+
+def draw_strands(xyz: _F32, rgba: _F32, widths: _F32, depth: _F32, softness: float) -> tuple[_F32, _F32]:
+    """K strands of P points: xyz [K, P, 3] px, px, depth; rgba [K, P, 4]; widths [K, P] px, in front of depth
+    [H, W] -> premultiplied rgb [H, W, 3] and what is still seen behind [H, W].
+    """
 
 def bind(
     vertices: _F32, faces: _I32, means: _F32, quats: _F32, log_scales: _F32, binding: _I32, threads: int = 0
@@ -101,6 +134,14 @@ def rasterize_vjp(
     threads: int = 0,
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
     """Gradients of means, quats, scales, opacities, sh and means2d."""
+
+def similarity(image: _F32, target: _F32, threads: int = 0) -> tuple[float, float, _F32]:
+    """Two images [H, W, C] -> mean absolute difference, mean SSIM, and [3, H, W, C] that the gradient needs."""
+
+def similarity_vjp(
+    image: _F32, target: _F32, partials: _F32, v_absolute: float, v_structural: float, threads: int = 0
+) -> _F32:
+    """Gradient [H, W, C] of the image from those of `similarity`'s two means."""
 
 class _Unet:
     def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:

@@ -34,7 +34,8 @@ class SurfacePass:
         self._target = self._resolved = None
         self._positions = ctx.buffer(reserve=12 * len(grid), dynamic=True)
         self._values = ctx.buffer(bytes(4 * len(grid)), dynamic=True)
-        self._pixels = ctx.buffer(np.ascontiguousarray(grid.pixels, np.float32))
+        pixels = np.zeros((len(grid), 2)) if grid.is_mesh else grid.pixels
+        self._pixels = ctx.buffer(np.ascontiguousarray(pixels, np.float32))
         self._faces = ctx.buffer(np.ascontiguousarray(grid.faces, np.uint32))
         self._size = grid.size
         self._arrays: dict[str, moderngl.VertexArray] = {}

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 
 from cap4d.avatar.deformer import DEFORM_STD
+from cap4d.avatar.similarity import l1_and_ssim
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004, sec. III-B
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # their K1, K2 at a dynamic range of 1
@@ -100,7 +101,11 @@ def gradient_distance(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor
 
 def photometric(image: torch.Tensor, target: torch.Tensor, weights: LossWeights) -> torch.Tensor:
     """0.6 L1 + 0.4 (1 - SSIM) of two [H, W, 3] images in [0, 1] (fact 33 without its LPIPS)."""
-    return weights.l1 * (image - target).abs().mean() + weights.dssim * (1 - ssim_map(image, target).mean())
+    if image.device.type == "cpu" and image.dtype == target.dtype == torch.float32:
+        absolute, similar = l1_and_ssim(image, target)
+    else:
+        absolute, similar = (image - target).abs().mean(), ssim_map(image, target).mean()
+    return weights.l1 * absolute + weights.dssim * (1 - similar)
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -49,8 +49,12 @@ def add(commands) -> None:
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted fit"
     )
     parser.add_argument(
-        "--ablate", choices=("unet", "lpips"), help="leave a part out, to see what it is worth"
+        "--ablate",
+        choices=("unet", "lpips", "remesh", "mmdm"),
+        help="leave a part out, to see what it is worth: the deformation network, the perceptual term, the "
+        "UV grid together with the network, or all captures but the first",
     )
+    add_reference_options(parser)
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="same seed, same machine: same avatar (default: 0)"
     )
@@ -91,6 +95,42 @@ def _add_choices(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_reference_options(parser: argparse.ArgumentParser) -> None:
+    """What is trained on, where it is not everything."""
+    parser.add_argument(
+        "--references",
+        metavar="N|FILE.json",
+        help="train on so many images of the first capture, chosen by view and expression, or on those that "
+        "a file lists as [[camera, frame], ...] (default: all that are not held out)",
+    )
+    parser.add_argument(
+        "--reference-seed",
+        type=int,
+        default=0,
+        metavar="S",
+        help="another choice of N images, from a random half (default: 0, from all)",
+    )
+    parser.add_argument(
+        "--hold-out-cameras",
+        metavar="A,B",
+        help="cameras of the first capture that are never trained on (default: none)",
+    )
+
+
+def chosen_references(arguments: argparse.Namespace, rig, hold_out: tuple[str, ...]):
+    """(camera, frame) pairs, or None for all."""
+    from cap4d.avatar.references import choose_references, read_references
+    from cap4d.capture.capture import Capture
+
+    wanted = arguments.references
+    if wanted is None:
+        return None
+    capture = Capture.load(arguments.captures[0])
+    if not wanted.lstrip("-").isdecimal():
+        return read_references(Path(wanted), capture)
+    return choose_references(capture, rig, int(wanted), hold_out=hold_out, seed=arguments.reference_seed)
+
+
 def run_fit(arguments: argparse.Namespace) -> None:
     from cap4d.avatar.fit import fit
     from cap4d.avatar.presets import Choices, preset_named
@@ -104,15 +144,19 @@ def run_fit(arguments: argparse.Namespace) -> None:
         per_face=arguments.per_face,
         prune=arguments.prune,
     )
+    rig = load_rig(arguments.rig)
+    hold_out = tuple(filter(None, (arguments.hold_out_cameras or "").split(",")))
     fit(
         arguments.captures,
-        load_rig(arguments.rig),
+        rig,
         arguments.output,
         preset=choices.applied(preset_named(arguments.preset, recipe_of(arguments.recipe))),
         resume=arguments.resume,
         ablate=arguments.ablate,
         seed=arguments.seed,
         lpips_weights=arguments.lpips_weights,
+        references=chosen_references(arguments, rig, hold_out),
+        hold_out=hold_out,
     )
 
 

@@ -44,30 +44,46 @@ class Performance:
 
 
 def synthesize(
-    rig: HeadRig, output: Path, *, views: int = 8, frames: int = 48, size: int = 256, seed: int = 0
+    rig: HeadRig,
+    output: Path,
+    *,
+    identity: int | None = None,
+    views: int = 8,
+    frames: int = 48,
+    size: int = 256,
+    seed: int = 0,
+    deviations: float = 1.0,
 ) -> None:
-    """Writes a capture of `rig` (neutral identity) in the FlowFace layout.
+    """Writes a capture of `rig` in the FlowFace layout.
 
     Args:
         rig: Any rig; drawn in its colours, or in one skin colour.
         output: The capture's folder, made if need be.
-        views: Cameras; every fourth one sees the head from behind, in a quarter of the frames.
+        identity: The number of a made-up person with painted skin, filmed from the front (see studio.py);
+            None is the rig's neutral identity in plain colours.
+        views: Cameras; without `identity` every fourth one sees the head from behind, in a quarter of the
+            frames.
         frames: The first one is neutral.
         size: Pixels a side.
         seed: Same seed, same capture.
+        deviations: Of a person: how far they move otherwise than the rig's model.
     Raises:
-        ArgumentError: A count that is not positive.
+        ArgumentError: A number out of its range; with `identity`, no UVs or a folder that is not new.
     """
-    for name, value in (("views", views), ("frames", frames), ("size", size)):
-        if value < 1:
-            raise ArgumentError(f"{name}: expected at least 1, got {value}")
+    check_sizes(identity=identity, views=views, frames=frames, size=size, seed=seed, deviations=deviations)
+    if identity is not None:
+        from cap4d.synth.studio import film
+
+        kind = {"views": views, "frames": frames, "size": size, "seed": seed, "deviations": deviations}
+        film(rig, output, identity=identity, **kind)
+        return
     output, rng = Path(output), np.random.default_rng(seed)
     subject = rig.subject()
     cameras, behind = _cameras(views, size, rng)
-    performance = _perform(rig, frames, rng)
+    performance = perform(rig, frames, rng)
     valid = np.ones((views, frames), bool)
     valid[behind] = np.arange(frames) % 4 == 0
-    _save(rig, output, cameras, performance, valid)
+    save_performance(rig, output, np.zeros(rig.n_identity, np.float32), cameras, performance, valid)
     for t in range(frames):
         vertices = head_vertices(subject, performance, t)
         shades = _shades(rig, vertices)
@@ -76,6 +92,19 @@ def synthesize(
                 rgb, matte = _draw(world_vertices(vertices, performance, t), rig.faces, shades, camera)
                 write_image(output / "images" / name / f"{t:05d}.png", rgb)
                 write_image(output / "bg" / name / f"{t:04d}.png", matte)
+
+
+def check_sizes(
+    *, identity: int | None, views: int, frames: int, size: int, seed: int, deviations: float
+) -> None:
+    """Raises ArgumentError where a number is out of its range."""
+    counts = {"views": (views, 1, 256), "frames": (frames, 1, 100_000), "size": (size, 1, 4096)}
+    seeds = {"identity": (identity or 0, 0, 2**63 - 1), "seed": (seed, 0, 2**63 - 1)}
+    for name, (value, low, high) in {**counts, **seeds}.items():
+        if not low <= value <= high:
+            raise ArgumentError(f"{name}: expected {low} to {high}, got {value}")
+    if not 0 <= deviations <= 4:
+        raise ArgumentError(f"deviations: expected 0 to 4, got {deviations}")
 
 
 def head_vertices(subject: Subject, performance: Performance, t: int) -> np.ndarray:
@@ -111,7 +140,8 @@ def _cameras(views: int, size: int, rng: np.random.Generator) -> tuple[dict[str,
     return cameras, behind
 
 
-def _perform(rig: HeadRig, frames: int, rng: np.random.Generator) -> Performance:
+def perform(rig: HeadRig, frames: int, rng: np.random.Generator) -> Performance:
+    """Expressions, glances and turns of the head; the first frame is at rest."""
     gaze = np.concatenate([rng.normal(0, np.radians([5.0, 9.0]), (frames, 2)), np.zeros((frames, 1))], 1)
     poses = {
         "eye_rot": np.clip(gaze, -0.35, 0.35),
@@ -158,16 +188,22 @@ def _random_expressions(rig: HeadRig, frames: int, rng: np.random.Generator) -> 
     return np.clip(rng.normal(0, 0.25 / (1 + np.arange(n) / 10), (frames, n)) * (high - low), low, high)
 
 
-def _save(
-    rig: HeadRig, output: Path, cameras: dict[str, Camera], performance: Performance, valid: np.ndarray
+def save_performance(
+    rig: HeadRig,
+    output: Path,
+    shape: np.ndarray,
+    cameras: dict[str, Camera],
+    performance: Performance,
+    valid: np.ndarray,
 ) -> None:
+    """Everything but the images: their folders, fit.npz and the list of views (`valid` bool[C, T])."""
     for name in cameras:
         (output / "images" / name).mkdir(parents=True, exist_ok=True)
         (output / "bg" / name).mkdir(parents=True, exist_ok=True)
     save_capture(
         output,
         rig_name=rig.name,
-        shape=np.zeros(rig.n_identity, np.float32),
+        shape=shape,
         expr=performance.expr,
         rot=performance.rot,
         tra=performance.tra,

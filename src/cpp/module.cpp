@@ -6,9 +6,12 @@ PYBIND11_MODULE(_core, m) {
   cap4d::register_bind(m);
   cap4d::register_ceilings(m);
   cap4d::register_grid_surface(m);
+  cap4d::register_lit_surface(m);
   cap4d::register_mesh(m);
   cap4d::register_render(m);
+  cap4d::register_similarity(m);
   cap4d::register_sort(m);
   cap4d::register_splatter(m);
+  cap4d::register_strands(m);
   cap4d::register_unet(m);
 }

@@ -13,11 +13,11 @@ from cap4d.app.background import Backdrop, Checkerboard
 from cap4d.app.layout import Rect
 from cap4d.app.overlays.color_map import color_map
 from cap4d.app.overlays.legend import Legend, rounded_up, ticks
-from cap4d.app.overlays.overlays import Overlay, Overlays, Part
+from cap4d.app.overlays.overlays import Overlay, Overlays, Part, why_not
 from cap4d.app.panels.legends import draw_legends
 from cap4d.app.renderers import CpuRenderer, GlRenderer
 from imgui_bundle import imgui
-from tiny_bundle import tiny_bundle
+from tiny_bundle import tiny_bundle, tiny_bundle_on_mesh
 
 from cap4d.player.avatar import Avatar
 
@@ -162,3 +162,26 @@ def test_legends_are_drawn() -> None:
         for texture in imgui.get_platform_io().textures:
             texture.set_status(imgui.ImTextureStatus.destroyed)
         imgui.destroy_context(context)
+
+
+# Without a grid ------------------------------------------------------------
+
+
+def test_the_rigs_own_triangles_have_a_mesh_and_no_uv_grid(ctx) -> None:
+    avatar = Avatar(tiny_bundle_on_mesh())
+    reasons = {overlay: why_not(overlay, avatar.bundle) for overlay in Overlay}
+    assert "no UV grid" in reasons[Overlay.UV] and "no network" in reasons[Overlay.DEFORMATION]
+    assert reasons[Overlay.MESH] == reasons[Overlay.DENSITY] == ""
+    assert not any(why_not(overlay, tiny_bundle(network=False)) for overlay in Overlay)
+    renderer, overlays = CpuRenderer(ctx, avatar), Overlays(ctx, avatar)
+    renderer.texture(avatar.idle.frame(1), avatar.camera)
+    target, pictures = ctx.simple_framebuffer((48, 48)), []
+    for shown in (set(), {Overlay.UV, Overlay.DEFORMATION}, {Overlay.MESH}, set(Overlay) - {Overlay.DENSITY}):
+        target.use()
+        target.clear()
+        overlays.shown = shown
+        overlays.draw(renderer, avatar.camera.resized(48, 48))
+        pictures.append(target.read())
+        assert overlays.legends() == []
+    assert pictures[0] == pictures[1] != pictures[2] == pictures[3]
+    assert ctx.error == "GL_NO_ERROR"
