@@ -109,6 +109,8 @@ def densify(
     n = len(rows.model)
     world = rows.model.gaussians["log_scales"].detach().exp().amax(1) * face_sizes[rows.model.binding]
     needless = _least(worth, settings.prune_least, n)
+    if per_face >= 1:
+        needless &= ~_last_of_their_face(needless, rows.model, len(face_sizes))
     freed = None if room is None else room + int(needless.sum())
     chosen = _most_wanted(evidence.mean_gradient(), settings.gradient, freed) & ~needless
     split = chosen & (world > settings.split_scale)
