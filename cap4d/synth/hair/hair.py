@@ -103,10 +103,9 @@ class Hair:
     def shade_scalp(self, colors: np.ndarray) -> np.ndarray:
         """sRGB albedo [V, 3] of the mesh with the skin under the hair tinted, painted hair taken away."""
         colors = np.array(colors, np.float64)
-        bare = self.painted & (self.scalp < 1)
-        if self.painted.any():
-            colors[bare] = skin_tone(colors, self.painted)
-        under = 0.5 * self.color + 0.02
+        tone = skin_tone(colors, self.painted | (self.brow > 0))
+        colors[self.painted] = tone
+        under = 0.6 * self.color + 0.1 * tone
         tint = np.maximum(0.92 * self.scalp, 0.35 * self.brow)[:, None]
         return colors * (1 - tint) + tint * under
 
@@ -131,6 +130,8 @@ def grow_hair(rig: HeadRig, neutral: np.ndarray, *, seed: int, style: str | None
     chosen, color = draw_style(rng, style), draw_color(rng)
     head = measure_head(rig, neutral)
     density = scalp_density(head, raised=chosen.raised) if chosen.count else np.zeros(len(head.vertices))
+    if chosen.count and len(rig.regions.get("hair", ())) and chosen.raised == 0:
+        density[rig.regions["hair"]] = 1
     if chosen.crown < 1:
         bare = np.clip((head.height(head.vertices) - 0.35) / 0.2, 0, 1)
         density = density * (1 - (1 - chosen.crown) * bare)
@@ -200,15 +201,19 @@ def _shadows(scalp, strands, head: HeadMeasures, surface: Surface) -> tuple[np.n
 def _colors(strands: np.ndarray, kind: np.ndarray, color: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """float32[K, P, 3]: strands differ, roots are darker than tips; brows and lashes are darker than hair."""
     count, points = strands.shape[:2]
-    tone = np.exp(rng.normal(0, 0.16, (count, 1, 1))) * np.exp(rng.normal(0, 0.03, (count, 1, 3)))
+    locks = np.sin(strands[:, 0] @ rng.normal(0, 160, (3, 3)) + rng.uniform(0, 6, 3)).mean(1)
+    tone = np.exp(rng.normal(0, 0.16, count) + 0.16 * locks)[:, None, None]
+    tone = tone * np.exp(rng.normal(0, 0.03, (count, 1, 3)))
     along = np.linspace(0, 1, points)[None, :, None]
-    fair = np.array([1.0, 0.62, 0.4])[kind][:, None, None]
-    return np.clip(color * tone * (0.82 + 0.3 * along) * fair + 0.01, 0, 1).astype(np.float32)
+    grey = np.full(3, color.mean())
+    face = np.minimum(0.6 * (0.6 * color + 0.4 * grey * [1.1, 1.0, 0.9]), 0.33)
+    base = np.stack([color, face, 0.3 * face])[kind][:, None]
+    return np.clip(base * tone * (0.82 + 0.3 * along) + 0.01, 0, 1).astype(np.float32)
 
 
 def _widths(strands: np.ndarray, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     along = np.linspace(0, 1, strands.shape[1])
-    width = HAIR_WIDTH * np.array([1.0, 0.9, 0.8])[kind] * rng.uniform(0.7, 1.3, len(strands))
+    width = HAIR_WIDTH * np.array([1.0, 0.75, 0.55])[kind] * rng.uniform(0.7, 1.3, len(strands))
     return (width[:, None] * np.interp(along, [0, 0.6, 1], [1, 1, 0.3])).astype(np.float32)
 
 
@@ -239,7 +244,8 @@ def _painted(rig: HeadRig, head: HeadMeasures) -> np.ndarray:
     tone = np.median(light[face]) if face.any() else np.median(light)
     where = (head.height(head.vertices) > 0.13) | (head.angle(head.vertices) > 50)
     high = head.height(head.vertices) > -0.9
-    dark = light < DARK * tone
+    on_scalp = (head.height(head.vertices) > 0.42) | (head.angle(head.vertices) > 50)
+    dark = light < np.where(on_scalp, 0.9, DARK) * tone
     if "hair" in rig.regions:
         dark[rig.regions["hair"]] = True
     return head.outer & where & high & dark
