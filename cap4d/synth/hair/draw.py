@@ -10,7 +10,7 @@ from cap4d import _core
 from cap4d.camera import Camera
 from cap4d.errors import ArgumentError
 from cap4d.mesh import MIN_DEPTH
-from cap4d.synth.hair.hair import Hair
+from cap4d.synth.hair.hair import Hair, best_rotation
 from cap4d.synth.hair.occlusion import DIRECTIONS, weights_towards
 
 SOFTNESS = 0.0025  # m behind a surface at which hair has vanished
@@ -124,7 +124,7 @@ def light_hair(
         facing = np.clip((out @ towards + 0.4) / 1.4, 0, 1)
         diffuse += reached * (0.35 * across + 1.15 * facing)
         half = _unit(to_eye + towards)
-        lean = (tangent * half).sum(-1) + tilt
+        lean = np.einsum("kpc,kpc->kp", tangent, half) + tilt
         reached *= facing
         gloss += reached * _lobe(lean + GLOSS_SHIFT, GLOSS_POWER)
         glow += reached * _lobe(lean + GLOW_SHIFT, GLOW_POWER)
@@ -166,11 +166,9 @@ def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _turn_of(hair: Hair, points: np.ndarray) -> np.ndarray:
     """[3, 3] the rotation of posed strands against the neutral ones."""
-    from cap4d.synth.hair.hair import _best_rotation
-
     still = ~hair.skin if (~hair.skin).any() else hair.skin
-    return _best_rotation(hair.strands[still, 0].astype(np.float64), points[still, 0].astype(np.float64))
+    return best_rotation(hair.strands[still, 0].astype(np.float64), points[still, 0].astype(np.float64))
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.maximum(np.sqrt((v * v).sum(-1, keepdims=True)), 1e-9)
+    return v / np.maximum(np.sqrt(np.einsum("...c,...c->...", v, v)), 1e-9)[..., None]

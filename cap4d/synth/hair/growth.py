@@ -10,6 +10,7 @@ from cap4d.synth.hair.scalp import HeadMeasures
 from cap4d.synth.hair.style import HairStyle
 
 MARGIN = 0.0012  # m; strands stay this far off the head
+PUSH_MOST = 0.008  # m; what seems to lie deeper does so beside an edge, where the distance is wrong
 SUBSTEPS = 2  # of growing between two points of a strand
 CROWN = 0.93, -0.45  # the whorl: its height, and its place behind the skull's axis, in skull units
 EAR_DOME = 0.006  # m; how far hair that lies over an ear is bulged by it
@@ -49,7 +50,7 @@ class Surface:
     def push_out(self, points: np.ndarray, margin: float = MARGIN) -> np.ndarray:
         """The points [..., 3], those within `margin` of the head moved out."""
         distance, normals = self.near(points)
-        return points + np.maximum(margin - distance, 0)[..., None] * normals
+        return points + np.clip(margin - distance, 0, PUSH_MOST)[..., None] * normals
 
 
 def _without_ears(head: HeadMeasures) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -133,8 +134,8 @@ def grow(
     """Strands [K, P, 3] m from roots [K, 3] with skin normals [K, 3]."""
     lengths = strand_lengths(head, style, roots, rng)
     strands = _comb(head, surface, style, roots, normals, lengths, rng)
-    strands = _gather(strands, roots, style, rng)
     strands = _curl(strands, lengths, style, rng)
+    strands = _gather(strands, roots, style, rng)
     strands = _frizz(strands, style, rng)
     body = surface.push_out(strands[:, 1:])
     return np.concatenate([roots[:, None], body], 1)
@@ -169,7 +170,7 @@ def _comb(head, surface, style, roots, normals, lengths, rng):
             heading = _unit((0.9 - 0.35 * loose) * heading + 0.55 * (flow + pull + rise * normal))
             points = points + step * heading
             left = distance + step[:, 0] * (heading * normal).sum(1)
-            points = points + np.maximum(MARGIN - left, 0)[:, None] * normal
+            points = points + np.clip(MARGIN - left, 0, PUSH_MOST)[:, None] * normal
             travelled = travelled + step
         strands.append(points)
     return np.stack(strands, 1)
@@ -209,7 +210,7 @@ def _frizz(strands: np.ndarray, style: HairStyle, rng: np.random.Generator) -> n
     """Smooth displacements of single strands; a few fly off."""
     count, points = strands.shape[:2]
     along = np.linspace(0, 1, points)
-    amount = style.frizz * rng.gamma(2, 0.4, count) * np.where(rng.random(count) < 0.015, 2.2, 1)
+    amount = style.frizz * rng.gamma(2, 0.4, count) * np.where(rng.random(count) < 0.01, 2, 1)
     bend, sway = rng.normal(0, 0.6, (2, count, 1, 3))
     wave = np.sin(np.pi * along * rng.uniform(0.8, 2.5, (count, 1)))[..., None]
     return strands + amount[:, None, None] * (bend * along[:, None] ** 1.5 + sway * wave * along[:, None])

@@ -102,7 +102,7 @@ def _ears(rig: HeadRig, vertices: np.ndarray, head: np.ndarray, eyes: np.ndarray
     for side in (1, -1):
         tip = vertices[near][np.argmax(side * vertices[near, 0])]
         reach = ((vertices[:, 1:] - tip[1:] + [0.012, 0]) / EAR_REACH) ** 2
-        ears |= head & (reach.sum(1) < 1) & (side * vertices[:, 0] > 0.8 * side * tip[0])
+        ears |= head & (reach.sum(1) < 1) & (side * vertices[:, 0] > 0.86 * side * tip[0])
     return ears
 
 

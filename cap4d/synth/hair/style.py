@@ -63,7 +63,9 @@ STYLES = {
         HairStyle("fringe", top=0.09, side=0.06, lift=0.013, sweep=(0, 0, 0.6), fringe=0.27, points=14),
         HairStyle("bob", count=11000, top=0.2, side=0.2, lift=0.017, part=0.02, cut=-0.75, gravity=0.6),
         HairStyle("long", count=9000, top=0.3, side=0.3, lift=0.016, part=0.0, cut=-1.7, gravity=0.6),
-        HairStyle("curly", top=0.07, side=0.035, lift=0.028, wave=0.006, wavelength=0.022, points=20),
+        HairStyle(
+            "curly", 14000, 22, 0.075, 0.04, 0.028, wave=0.008, wavelength=0.026, clump=0.8, clumps=420
+        ),
         HairStyle("receding", top=0.03, side=0.015, lift=0.009, raised=0.20, crown=0.5, sweep=(0, 0, -0.4)),
         HairStyle("horseshoe", count=9000, top=0.012, side=0.014, lift=0.007, raised=0.1, crown=0.0),
     )
