@@ -50,7 +50,12 @@ class Surface:
     def push_out(self, points: np.ndarray, margin: float = MARGIN) -> np.ndarray:
         """The points [..., 3], those within `margin` of the head moved out."""
         distance, normals = self.near(points)
-        return points + np.clip(margin - distance, 0, PUSH_MOST)[..., None] * normals
+        out = points + np.clip(margin - distance, 0, PUSH_MOST)[..., None] * normals
+        deep = distance < margin - PUSH_MOST
+        if deep.any():
+            distance, normals = self.near(out[deep])
+            out[deep] += np.clip(margin - distance, 0, PUSH_MOST)[:, None] * normals
+        return out
 
 
 def _without_ears(head: HeadMeasures) -> tuple[np.ndarray, list[np.ndarray]]:
