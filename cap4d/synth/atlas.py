@@ -29,6 +29,7 @@ class Atlas:
         kinds: float32[P, 6] how much each texel is of each of KINDS.
         old: float32[P, 3] the rig's own colours there, sRGB.
         uvs: float32[T, 2] the rig's texture vertices as column and row.
+        corners, weights: int[P, 3] and float32[P, 3] the vertices that each texel is a mixture of.
     """
 
     size: int
@@ -37,10 +38,16 @@ class Atlas:
     kinds: np.ndarray
     old: np.ndarray
     uvs: np.ndarray
+    corners: np.ndarray
+    weights: np.ndarray
 
     def of(self, kind: str) -> np.ndarray:
         """int[N] the texels that are mostly of one kind."""
         return np.flatnonzero(self.kinds.argmax(1) == KINDS.index(kind))
+
+    def of_vertices(self, values: np.ndarray, texels: np.ndarray) -> np.ndarray:
+        """[V] values of vertices -> [N] of `texels`."""
+        return (values[self.corners[texels]] * self.weights[texels]).sum(1)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """[P, C] -> float32[S, S, C]; texels that nothing covers take the nearest one's, for filters."""
@@ -82,6 +89,8 @@ def build_atlas(rig: HeadRig, size: int) -> Atlas:
         kinds=on_texels(np.eye(len(KINDS))[kinds_of_vertices(rig)]),
         old=on_texels(colors),
         uvs=uvs.astype(np.float32),
+        corners=corners,
+        weights=weights,
     )
 
 

@@ -8,15 +8,11 @@ import numpy as np
 
 # Linear RGB of skin without pigment, and what one unit of each pigment takes away (natural logarithm): fitted
 # by eye to photographs of fair to very dark skin.
-SKIN_BASE = np.array([0.84, 0.73, 0.66])
+SKIN_BASE = np.array([0.84, 0.72, 0.59])
 MELANIN = np.array([0.46, 0.80, 1.08])
 HAEMOGLOBIN = np.array([0.05, 0.42, 0.34])
 
 # Linear RGB.
-HAIR_COLORS = np.array(
-    [[0.010, 0.007, 0.006], [0.030, 0.015, 0.009], [0.075, 0.036, 0.017], [0.22, 0.12, 0.05],
-     [0.36, 0.23, 0.11], [0.17, 0.055, 0.018], [0.22, 0.21, 0.20]]
-)  # fmt: skip
 IRIS_COLORS = np.array(
     [[0.055, 0.022, 0.008], [0.13, 0.055, 0.018], [0.16, 0.115, 0.035], [0.11, 0.15, 0.085],
      [0.12, 0.20, 0.31], [0.20, 0.25, 0.29]]
@@ -36,6 +32,7 @@ class Complexion:
         blush, freckles, moles, stubble, brow, lip: Amounts.
         hair, iris, iris_inner, cloth: [3].
         lip_tint: [3] what the lips' colour is multiplied by.
+        scalp: [V] how densely hair grows, or None before it is grown.
         seed: Of all that is strewn over the skin.
     """
 
@@ -53,6 +50,7 @@ class Complexion:
     cloth: np.ndarray
     lip_tint: np.ndarray
     seed: int
+    scalp: np.ndarray | None = None
 
     def skin(self, melanin: np.ndarray, haemoglobin: np.ndarray) -> np.ndarray:
         """[N] and [N] amounts of pigment -> [N, 3] linear albedo."""
@@ -60,11 +58,15 @@ class Complexion:
         return SKIN_BASE * np.exp(-taken)
 
 
-def draw_complexion(rng: np.random.Generator) -> Complexion:
-    """A plausible person: dark eyes and hair go with dark skin, freckles with fair."""
-    melanin = float(0.16 + 1.9 * rng.beta(1.1, 1.9))
+def draw_complexion(rng: np.random.Generator, hair: np.ndarray) -> Complexion:
+    """A plausible person: dark eyes go with dark skin and dark hair, freckles with fair.
+
+    Args:
+        hair: [3] its colour, linear RGB.
+    """
+    light_hair = float(np.clip((hair.mean() - 0.03) / 0.1, 0, 1))
+    melanin = float(0.22 + (1.9 - 1.3 * light_hair) * rng.beta(1.1, 1.9))
     fair = np.clip((0.75 - melanin) / 0.5, 0, 1)
-    hair = _pick(rng, HAIR_COLORS, [0.25, 0.28, 0.17, 0.1, 0.1, 0.05, 0.05], fair)
     iris = _pick(rng, IRIS_COLORS, [0.2, 0.2, 0.15, 0.15, 0.2, 0.1], fair)
     bearded = rng.random() < 0.5
     return Complexion(
@@ -76,7 +78,7 @@ def draw_complexion(rng: np.random.Generator) -> Complexion:
         stubble=float(bearded * rng.choice([0.25, 0.5, 0.85])),
         brow=float(rng.uniform(0.7, 1.0)),
         lip=float(rng.uniform(0.35, 0.7) if bearded else rng.uniform(0.5, 1.0)),
-        hair=hair * rng.uniform(0.8, 1.25, 3).mean(),
+        hair=hair,
         iris=iris * rng.uniform(0.8, 1.2),
         iris_inner=np.array([0.20, 0.095, 0.026]) * rng.uniform(0.5, 1.2),
         cloth=CLOTH_COLORS[rng.integers(len(CLOTH_COLORS))] * rng.uniform(0.7, 1.3),

@@ -6,7 +6,7 @@ features are found by the 68 landmarks where the rig has them, by the rig's own 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from cap4d.synth.complexion import Complexion
 MM = 1e-3
 LIP, LIP_INSIDE, NOSE_TIP, NOSE_BASE, CHIN = slice(48, 60), slice(60, 68), 30, 33, 8
 BROWS, EYES = (slice(17, 22), slice(22, 27)), (slice(36, 42), slice(42, 48))
-PUPIL_DEG, IRIS_DEG = 9.0, 27.0  # from the gaze's direction, seen from the ball's centre
+PUPIL_DEG, IRIS_DEG = 8.5, 25.0  # from the gaze's direction, seen from the ball's centre
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,13 @@ class Paint:
     height: np.ndarray
 
 
-def paint_texture(rig: HeadRig, atlas: Atlas, look: Complexion) -> np.ndarray:
-    """float32[S, S, 8] as `light_surface` reads it: albedo, specular, roughness, scattering, slopes."""
+def paint_texture(rig: HeadRig, atlas: Atlas, look: Complexion, scalp: np.ndarray) -> np.ndarray:
+    """float32[S, S, 8] as `light_surface` reads it: albedo, specular, roughness, scattering, slopes.
+
+    Args:
+        scalp: [V] how densely hair grows at each vertex.
+    """
+    look = replace(look, scalp=scalp)
     layers = np.zeros((len(atlas.points), 7), np.float32)
     for kind in KINDS:
         texels = atlas.of(kind)
@@ -94,11 +99,12 @@ def _skin(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> P
 
     beard = _stubble(p, marks, seed) * look.stubble * (1 - lips)
     albedo += beard[:, None] * (look.hair * 0.8 + 0.15 * albedo - albedo)
-    brows = _brows(rig, p, atlas.old[texels], marks, seed) * look.brow
+    brows = 0.5 * _brows(rig, p, marks, seed) * look.brow
     albedo += brows[:, None] * (look.hair * 0.75 + 0.02 - albedo)
     lash = _lash_line(rig, p, marks)
     albedo += (0.75 * lash)[:, None] * (look.hair * 0.5 + 0.01 - albedo)
-    hair = _scalp(rig, p, atlas.old[texels], marks, seed)
+    hair = np.clip(atlas.of_vertices(look.scalp, texels), 0, 1)
+    hair = paint.soft_step(hair + 0.35 * noise(p, 2.5 * MM, seed + 18, 2), 0.25, 0.85)
     strands = 1 + 0.5 * noise(p * [1, 0.35, 0.35], 1.2 * MM, seed + 9, 2)
     albedo += (0.92 * hair)[:, None] * (look.hair * strands[:, None] + 0.03 * albedo - albedo)
     height += hair * 0.25 * MM * noise(p, 1.5 * MM, seed + 10, 2)
@@ -191,12 +197,10 @@ def _lips(rig: HeadRig, p: np.ndarray, old: np.ndarray, marks: np.ndarray | None
     return lips
 
 
-def _brows(rig, p: np.ndarray, old: np.ndarray, marks: np.ndarray | None, seed: int) -> np.ndarray:
-    """[N] brow hairs: short strokes that lean outwards, thinning towards the tail."""
+def _brows(rig: HeadRig, p: np.ndarray, marks: np.ndarray | None, seed: int) -> np.ndarray:
+    """[N] the ground of the brows: short strokes that lean outwards, thinning towards the tail."""
     if marks is None:
-        dark = paint.soft_step(0.55 - old.mean(1), 0, 0.2)
-        front = (p[:, 2] > np.quantile(rig.template[:, 2], 0.75)) & (p[:, 1] < 0.06)
-        return dark * front * (0.75 + 0.4 * noise(p, 1.2 * MM, seed + 13, 2))
+        return np.zeros(len(p))
     total = np.zeros(len(p))
     for brow in BROWS:
         line = marks[brow] if abs(marks[brow][0, 0]) < abs(marks[brow][-1, 0]) else marks[brow][::-1]
@@ -260,23 +264,6 @@ def _stubble(p: np.ndarray, marks: np.ndarray | None, seed: int) -> np.ndarray:
     return inside * front * under_lip * (0.28 + 0.6 * dots)
 
 
-def _scalp(rig, p: np.ndarray, old: np.ndarray, marks: np.ndarray | None, seed: int) -> np.ndarray:
-    """[N] close-cropped hair above a hairline that is not a drawn line."""
-    if marks is None:
-        if "hair" not in rig.regions:
-            return np.zeros(len(p))
-        dark = paint.soft_step(0.62 - old.mean(1), 0, 0.25)
-        return dark * ((p[:, 1] > 0.06) | (p[:, 2] < 0.02))
-    brow, temple, ear = marks[17:27].mean(0), marks[0], marks[1]
-    z = [ear[2] - 0.12, ear[2] - 0.06, ear[2] - 0.02, temple[2] + 0.01, brow[2] - 0.025, brow[2]]
-    y = [temple[1] - 0.055, temple[1] - 0.045, temple[1] - 0.005, temple[1] + 0.02, brow[1] + 0.045, brow[1] + 0.055]
-    line = np.interp(p[:, 2], z, y) + 3 * MM * noise(p, 0.014, seed + 17, 2) + 1.5 * MM * noise(p, 2 * MM, seed + 18)
-    out = np.abs(temple[0])
-    low = 1 - paint.soft_step(p[:, 1], temple[1] + 0.004, temple[1] + 0.02)
-    on_ear = low * paint.soft_step(np.abs(p[:, 0]), out + 0.004, out + 0.010)
-    return paint.soft_step(p[:, 1] - line, -0.004, 0.008) * (1 - on_ear)
-
-
 def _eye(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Paint:
     p, seed = atlas.points[texels], look.seed
     albedo = np.tile(np.array([0.66, 0.62, 0.59]), (len(p), 1))
@@ -294,7 +281,7 @@ def _eye(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Pa
 def _eyeball(arm: np.ndarray, angle: np.ndarray, look: Complexion, seed: int) -> np.ndarray:
     veins = 1 - np.abs(noise(arm * 0.012, 0.0055, seed + 20, 3)) / 0.07
     outer = paint.soft_step(angle, IRIS_DEG + 2, 62)
-    sclera = np.array([0.70, 0.665, 0.635]) - np.outer(outer, [0.06, 0.14, 0.13])
+    sclera = np.array([0.60, 0.565, 0.535]) - np.outer(outer, [0.10, 0.17, 0.16])
     sclera = sclera - (np.clip(veins, 0, 1) * (0.25 + outer))[:, None] * np.array([0.04, 0.16, 0.15])
     around = np.arctan2(arm[:, 1], arm[:, 0])
     ring = np.stack([np.cos(around), np.sin(around)], 1)
@@ -307,7 +294,8 @@ def _eyeball(arm: np.ndarray, angle: np.ndarray, look: Complexion, seed: int) ->
     pupil = 1 - paint.soft_step(angle, PUPIL_DEG - 1, PUPIL_DEG + 1)
     iris += pupil[:, None] * (0.004 - iris)
     edge = 1 - paint.soft_step(angle, IRIS_DEG - 1.6, IRIS_DEG + 1.6)
-    return sclera + edge[:, None] * (iris - sclera)
+    lid = 1 - 0.55 * paint.soft_step(arm[:, 1], 0.12, 0.42) - 0.15 * paint.soft_step(-arm[:, 1], 0.2, 0.45)
+    return (sclera + edge[:, None] * (iris - sclera)) * lid[:, None]  # with the shade of lids and lashes
 
 
 def _teeth(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Paint:

@@ -44,6 +44,11 @@ class Occlusion:
         visible = self.visible + w[:, None] * (other.visible - self.visible)
         return Occlusion(self.open + w * (other.open - self.open), visible)
 
+    def dimmed(self, share: np.ndarray) -> Occlusion:
+        """Times `share` [V]."""
+        share = share.astype(np.float32)
+        return Occlusion(self.open * share, self.visible * share[:, None])
+
 
 def draw_lights(rng: np.random.Generator) -> Lights:
     """A key light from one side above, a fill from the other, and a rim light from behind."""
@@ -55,10 +60,10 @@ def draw_lights(rng: np.random.Generator) -> Lights:
     ]
     warmth = rng.uniform(-0.10, 0.16)
     tint = np.array([[1 + warmth, 1, 1 - warmth], [1 - warmth, 1, 1 + warmth], [1, 1, 1.0]])
-    strength = np.array([rng.uniform(0.62, 0.80), rng.uniform(0.16, 0.30), rng.uniform(0.25, 0.5)])
+    strength = np.array([rng.uniform(0.78, 1.0), rng.uniform(0.16, 0.32), rng.uniform(0.3, 0.6)])
     yaw, pitch = np.radians(np.array(angles)).T
     directions = np.stack([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), -np.cos(yaw) * np.cos(pitch)], 1)
-    sky = rng.uniform(0.40, 0.50) * np.array([0.97, 1.0, 1.05])
+    sky = rng.uniform(0.32, 0.42) * np.array([0.97, 1.0, 1.05])
     return Lights(
         directions.astype(np.float32),
         (tint * strength[:, None]).astype(np.float32),

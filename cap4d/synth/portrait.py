@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,14 @@ from cap4d.rig.head import HeadRig, Subject
 from cap4d.synth.atlas import KINDS, build_atlas, kinds_of_vertices
 from cap4d.synth.complexion import Complexion, draw_complexion
 from cap4d.synth.face_paint import paint_texture
+from cap4d.synth.hair import Hair, HairLights, composite_hair, draw_hair, grow_hair
 from cap4d.synth.idle import expression_vector, speaks_arkit
 from cap4d.synth.light import Lights, Occlusion, cast_shadows, draw_lights
 
 SUPERSAMPLE = 2  # samples per pixel side
 IDENTITY_SPREAD, IDENTITY_LIMIT = 0.85, 2.0  # standard deviation and limit of each identity mode
+HAIR_LIGHT, HAIR_SKY = 0.6, 1.3  # of the skin's linear light
+SMOOTHINGS = 6  # rounds of averaging of the normals that scattered light sees
 SHOULDER = 0.72  # linear value above which highlights are compressed
 
 
@@ -29,6 +33,7 @@ class Person:
         shape: float32[S] identity.
         subject: The rig with that identity.
         uvs: float32[T, 2] texture vertices in texels; `texture`: float32[S, S, 8], see `paint_texture`.
+        neighbours: Sparse matrix that averages each vertex with those around it.
     """
 
     rig: HeadRig
@@ -36,9 +41,11 @@ class Person:
     subject: Subject
     look: Complexion
     lights: Lights
+    hair: Hair
     occlusion: Occlusion
     uvs: np.ndarray
     texture: np.ndarray
+    neighbours: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +61,14 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """The person's mesh in one frame, head-fixed, OpenCV axes: positions, normals, smoothed normals [V, 3]."""
+    """The person in one frame, head-fixed, OpenCV axes: vertices, their normals and smoothed normals [V, 3],
+    and the points of the hair.
+    """
 
     vertices: np.ndarray
     normals: np.ndarray
     soft: np.ndarray
+    hair: np.ndarray
 
 
 def draw_person(rig: HeadRig, identity: int, *, texels: int = 1024) -> Person:
@@ -66,7 +76,9 @@ def draw_person(rig: HeadRig, identity: int, *, texels: int = 1024) -> Person:
     body, looks, light = (np.random.default_rng([identity, part]) for part in range(3))
     shape = np.clip(body.normal(0, IDENTITY_SPREAD, rig.n_identity), -IDENTITY_LIMIT, IDENTITY_LIMIT)
     shape = shape.astype(np.float32)
-    subject, look, lights = rig.subject(shape), draw_complexion(looks), draw_lights(light)
+    subject, lights = rig.subject(shape), draw_lights(light)
+    hair = grow_hair(rig, subject.neutral, seed=identity)
+    look = draw_complexion(looks, linear(np.asarray(hair.color, np.float64)))
     atlas = build_atlas(rig, texels)
     return Person(
         rig=rig,
@@ -74,16 +86,19 @@ def draw_person(rig: HeadRig, identity: int, *, texels: int = 1024) -> Person:
         subject=subject,
         look=look,
         lights=lights,
-        occlusion=_occlusion(rig, subject, lights),
+        hair=hair,
+        occlusion=_occlusion(rig, subject, lights).dimmed(1 - hair.shadow),
         uvs=atlas.uvs,
-        texture=paint_texture(rig, atlas, look),
+        texture=paint_texture(rig, atlas, look, hair.scalp),
+        neighbours=_neighbours(rig.faces, len(rig.template)),
     )
 
 
-def pose_of(vertices: np.ndarray, faces: np.ndarray) -> Pose:
+def pose_person(person: Person, vertices: np.ndarray) -> Pose:
     """What all pictures of one frame share. `vertices` [V, 3] head-fixed, OpenCV axes."""
+    faces = person.rig.faces
     normals = vertex_normals(vertices, faces)
-    return Pose(vertices, normals, _smoothed(normals, faces))
+    return Pose(vertices, normals, _smoothed(normals, person.neighbours), person.hair.pose(vertices))
 
 
 def draw_samples(person: Person, pose: Pose, camera: Camera) -> Samples:
@@ -115,6 +130,15 @@ def draw_samples(person: Person, pose: Pose, camera: Camera) -> Samples:
     return Samples(rgb, fragments.hit.astype(np.float32), depth)
 
 
+def picture(person: Person, pose: Pose, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Straight sRGB [H, W, 3] and coverage [H, W] of a posed person; `camera` is head-fixed."""
+    large = camera.resized(camera.width * SUPERSAMPLE, camera.height * SUPERSAMPLE)
+    samples = draw_samples(person, pose, large)
+    rgb, matte = develop(samples, SUPERSAMPLE)
+    layer = draw_hair(person.hair, pose.hair, camera, _hair_lights(person.lights), samples.depth)
+    return composite_hair(rgb, matte, layer)
+
+
 def develop(samples: Samples, supersample: int) -> tuple[np.ndarray, np.ndarray]:
     """Straight sRGB [H, W, 3] (white where nothing is) and coverage [H, W]."""
     height, width = (n // supersample for n in samples.alpha.shape)
@@ -124,12 +148,28 @@ def develop(samples: Samples, supersample: int) -> tuple[np.ndarray, np.ndarray]
     return np.where(matte[..., None] > 0, srgb(linear), 1), matte
 
 
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] to linear light."""
+    return np.where(srgb < 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
 def srgb(linear: np.ndarray) -> np.ndarray:
     """Linear light to sRGB in [0, 1], highlights rolled off."""
     over = np.maximum(linear - SHOULDER, 0)
     linear = np.minimum(linear, SHOULDER) + (1 - SHOULDER) * (1 - np.exp(-over / (1 - SHOULDER)))
     low = linear * 12.92
     return np.where(linear < 0.0031308, low, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def _hair_lights(lights: Lights) -> HairLights:
+    """Hair is lit in display values: strengths that look as the skin's do."""
+    return HairLights(
+        directions=lights.directions,
+        strengths=HAIR_LIGHT * lights.colors.mean(1),
+        sky=HAIR_SKY * float(lights.sky.mean()),
+        ground=HAIR_SKY * float(lights.ground.mean()),
+        up=np.array([0.0, -1.0, 0.0]),
+    )
 
 
 def _occlusion(rig: HeadRig, subject: Subject, lights: Lights) -> Occlusion:
@@ -147,17 +187,19 @@ def _head(subject: Subject, expr: np.ndarray) -> np.ndarray:
     return opencv_from_rig(subject.pose(expr).astype(np.float64))
 
 
-def _smoothed(normals: np.ndarray, faces: np.ndarray, rounds: int = 6) -> np.ndarray:
-    """[V, 3] normals averaged over their neighbourhood: what light sees that wanders under the skin."""
-    from scipy.sparse import csr_matrix
+def _neighbours(faces: np.ndarray, count: int):
+    """Sparse [count, count] matrix that averages every vertex with those around it."""
+    from scipy.sparse import csr_matrix, diags, identity
 
     rows, columns = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
-    ones = np.ones(len(rows) * 2)
-    links = csr_matrix(
-        (ones, (np.concatenate([rows, columns]), np.concatenate([columns, rows]))), (len(normals),) * 2
-    )
-    soft = normals
-    for _ in range(rounds):
-        soft = soft + links @ soft
-        soft = soft / np.maximum(np.linalg.norm(soft, axis=1, keepdims=True), 1e-12)
-    return soft
+    ends = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
+    links = csr_matrix((np.ones(2 * len(rows), np.float32), ends), (count, count)) + identity(count, np.float32)
+    return (diags(1 / np.asarray(links.sum(1)).ravel()) @ links).astype(np.float32).tocsr()
+
+
+def _smoothed(normals: np.ndarray, neighbours) -> np.ndarray:
+    """[V, 3] normals averaged over their neighbourhood: what light sees that wanders under the skin."""
+    soft = normals.astype(np.float32)
+    for _ in range(SMOOTHINGS):
+        soft = neighbours @ soft
+    return soft / np.maximum(np.linalg.norm(soft, axis=1, keepdims=True), 1e-12)

@@ -18,7 +18,7 @@ from cap4d.rig.head import HeadRig
 from cap4d.synth.body import draw_body
 from cap4d.synth.capture import Performance, perform, save_performance
 from cap4d.synth.folder import check_new_folder, new_folder
-from cap4d.synth.portrait import SUPERSAMPLE, Person, Pose, develop, draw_person, draw_samples, pose_of
+from cap4d.synth.portrait import Person, Pose, draw_person, picture, pose_person
 from cap4d.track.progress import progress
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ def film(
         for t in progress(range(frames), f"{output}: frames of {views} views", frames):
             expr, turns = performance.expr[t], {n: getattr(performance, n)[t] for n in ("eye_rot", "neck_rot")}
             vertices = opencv_from_rig(body.pose(expr, **turns).astype(np.float64))
-            _shoot(folder, person, pose_of(vertices, rig.faces), cameras, performance, t)
+            _shoot(folder, person, pose_person(person, vertices), cameras, performance, t)
     log.info("%s: %d images in %.0f s", output, views * frames, time.monotonic() - start)
 
 
@@ -84,12 +84,6 @@ def ring_of_cameras(views: int, size: int, rng: np.random.Generator) -> dict[str
         away = np.array([np.sin(y) * np.cos(p), -np.sin(p), -np.cos(y) * np.cos(p)])
         cameras[f"cam{i:02d}"] = Camera(K, look_at(TARGET + DISTANCE * away, TARGET), size, size)
     return cameras
-
-
-def picture(person: Person, pose: Pose, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Straight sRGB [H, W, 3] and coverage [H, W] of a posed person; `camera` is head-fixed."""
-    large = camera.resized(camera.width * SUPERSAMPLE, camera.height * SUPERSAMPLE)
-    return develop(draw_samples(person, pose, large), SUPERSAMPLE)
 
 
 def _shoot(

@@ -8,6 +8,7 @@
 namespace cap4d {
 namespace {
 
+constexpr float kSeenThrough = 1.0f / 128.0f;  // a pixel ends when less of what lies behind is seen
 constexpr float kWidthMin = 1.0f;  // px; a thinner line is drawn this wide and so much fainter
 
 struct Point {
@@ -34,7 +35,7 @@ Point load(const StrandPoints& points, std::size_t i, bool steep) {
 
 void blend(const Point& at, float alpha, std::size_t pixel, const StrandImage& image) {
   float& transmittance = image.transmittance[pixel];
-  if (transmittance < kTransmittanceMin) return;
+  if (transmittance < kSeenThrough) return;
   alpha *= std::clamp((image.depth[pixel] - at.depth) / image.softness + 1.0f, 0.0f, 1.0f);
   if (!(alpha > 0)) return;
   const float weight = transmittance * std::min(alpha, kAlphaMax);

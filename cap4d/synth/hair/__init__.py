@@ -1,7 +1,7 @@
 """Procedural hair for synthetic captures: grown on any rig's head, posed with it, drawn before its depth.
 
-scalp.py says where hair grows, style.py what it is like, growth.py and face.py grow it, occlusion.py finds its
-shadows, draw.py makes pictures of it.
+scalp.py says where hair grows, style.py what it is like, growth.py and face.py grow it, occlusion.py finds
+its shadows, draw.py makes pictures of it.
 """
 
 from cap4d.synth.hair.draw import HairLayer, HairLights, composite_hair, draw_hair

@@ -10,14 +10,16 @@ from cap4d import _core
 from cap4d.camera import Camera
 from cap4d.errors import ArgumentError
 from cap4d.mesh import MIN_DEPTH
-from cap4d.synth.hair.hair import Hair
+from cap4d.synth.hair.hair import Hair, best_rotation
 from cap4d.synth.hair.occlusion import DIRECTIONS, weights_towards
 
 SOFTNESS = 0.0025  # m behind a surface at which hair has vanished
 SAMPLES = 2  # a pixel's side, when no depth says otherwise
 OPACITY = 0.85
-GLOSS, GLOSS_POWER, GLOSS_SHIFT = 0.16, 60.0, 0.06  # of the reflection at a strand's surface
+GLOSS, GLOSS_POWER, GLOSS_SHIFT = 0.9, 50.0, 0.06  # of the reflection at a strand's surface
 GLOW, GLOW_POWER, GLOW_SHIFT = 0.55, 14.0, -0.10  # of light that leaves it after a reflection inside
+
+TILT, GOLDEN = np.float32(0.16), np.float32(0.618034)  # scales of single hairs tilt differently
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +86,7 @@ def draw_hair(
         hair.widths * np.float32(0.5 * (large.K[0, 0] + large.K[1, 1])) / np.maximum(xyz[..., 2], MIN_DEPTH)
     )
     rgb, clear = _core.draw_strands(xyz, rgba, widths.astype(np.float32), depth, SOFTNESS)
-    boxes = (camera.height, n, camera.width, n)
-    return HairLayer(rgb.reshape(*boxes, 3).mean((1, 3)), 1 - clear.reshape(boxes).mean((1, 3)))
+    return HairLayer(_smaller(rgb, n), 1 - _smaller(clear, n))
 
 
 def composite_hair(rgb: np.ndarray, matte: np.ndarray, layer: HairLayer) -> tuple[np.ndarray, np.ndarray]:
@@ -100,8 +101,9 @@ def composite_hair(rgb: np.ndarray, matte: np.ndarray, layer: HairLayer) -> tupl
 def light_hair(
     hair: Hair, points: np.ndarray, eye: np.ndarray, lights: HairLights, turn: np.ndarray
 ) -> np.ndarray:
-    """float32[K, P, 3] sRGB of every point seen from `eye` [3] (Kajiya and Kay 1989; two highlights as Marschner
-    et al. 2003 found them).
+    """float32[K, P, 3] sRGB of every point seen from `eye` [3].
+
+    Kajiya and Kay 1989, with the two highlights that Marschner et al. 2003 found.
 
     Args:
         turn: [3, 3] world from the head's axes.
@@ -112,6 +114,7 @@ def light_hair(
     open_ = hair.through.mean(-1)
     sky = lights.ground + (lights.sky - lights.ground) * (0.5 + 0.5 * out @ np.float32(lights.up))
     diffuse = sky * np.minimum(0.18 + 1.7 * open_, 1.15)
+    tilt = TILT * (np.arange(len(points), dtype=np.float32)[:, None] * GOLDEN % 1 - 0.5)
     gloss, glow = np.zeros_like(open_), np.zeros_like(open_)
     for direction, strength in zip(lights.directions, lights.strengths, strict=True):
         towards = np.float32(direction / np.linalg.norm(direction))
@@ -121,13 +124,19 @@ def light_hair(
         facing = np.clip((out @ towards + 0.4) / 1.4, 0, 1)
         diffuse += reached * (0.35 * across + 1.15 * facing)
         half = _unit(to_eye + towards)
-        lean = (tangent * half).sum(-1)
+        lean = np.einsum("kpc,kpc->kp", tangent, half) + tilt
         reached *= facing
         gloss += reached * _lobe(lean + GLOSS_SHIFT, GLOSS_POWER)
         glow += reached * _lobe(lean + GLOW_SHIFT, GLOW_POWER)
     sheen = (GLOSS * gloss)[..., None] * (0.5 + 0.5 * np.sqrt(hair.colors))
     lit = hair.colors * (diffuse + 2 * GLOW * glow)[..., None] + sheen
     return np.clip(np.nan_to_num(lit), 0, 1).astype(np.float32)
+
+
+def _smaller(image: np.ndarray, n: int) -> np.ndarray:
+    """The means of n x n pixels."""
+    total = sum(image[row::n, column::n] for row in range(n) for column in range(n))
+    return total / np.float32(n * n)
 
 
 def _lobe(lean: np.ndarray, power: float) -> np.ndarray:
@@ -157,11 +166,9 @@ def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _turn_of(hair: Hair, points: np.ndarray) -> np.ndarray:
     """[3, 3] the rotation of posed strands against the neutral ones."""
-    from cap4d.synth.hair.hair import _best_rotation
-
     still = ~hair.skin if (~hair.skin).any() else hair.skin
-    return _best_rotation(hair.strands[still, 0].astype(np.float64), points[still, 0].astype(np.float64))
+    return best_rotation(hair.strands[still, 0].astype(np.float64), points[still, 0].astype(np.float64))
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.maximum(np.sqrt((v * v).sum(-1, keepdims=True)), 1e-9)
+    return v / np.maximum(np.sqrt(np.einsum("...c,...c->...", v, v)), 1e-9)[..., None]

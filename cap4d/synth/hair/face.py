@@ -9,11 +9,11 @@ from cap4d.rig.head import HeadRig
 from cap4d.synth.hair.scalp import HeadMeasures, Roots
 
 RESOLUTION = 0.00025  # m a pixel of the front view in which roots are found
-BROW_WIDTH = 0.0085  # m
-BROWS, LASHES = 420, 70  # strands on a side; of an upper lid
-LASH = 0.0085  # m
-# An eyebrow when the rig has no landmarks: distance from the middle and height over the eyes, in halves of the
-# distance between the eyes.
+BROW_WIDTH = 0.0075  # m
+BROWS, LASHES = 420, 110  # strands on a side; of an upper lid
+LASH = 0.0048  # m
+# An eyebrow when the rig has no landmarks: distance from the middle and height over the eyes, in halves of
+# the distance between the eyes.
 BROW_LINE = np.array([[0.42, 0.56], [0.75, 0.68], [1.15, 0.76], [1.5, 0.70], [1.78, 0.50]])
 LEFT_BROW, RIGHT_BROW = slice(22, 27), slice(17, 22)  # of 68 landmarks
 

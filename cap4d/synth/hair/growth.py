@@ -6,27 +6,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cap4d.synth.hair.scalp import HeadMeasures, Roots
+from cap4d.synth.hair.scalp import HeadMeasures
 from cap4d.synth.hair.style import HairStyle
 
 MARGIN = 0.0012  # m; strands stay this far off the head
+PUSH_MOST = 0.008  # m; what seems to lie deeper does so beside an edge, where the distance is wrong
 SUBSTEPS = 2  # of growing between two points of a strand
 CROWN = 0.93, -0.45  # the whorl: its height, and its place behind the skull's axis, in skull units
+EAR_DOME = 0.006  # m; how far hair that lies over an ear is bulged by it
 FACE_HALF = 0.062  # m; hair that hangs is kept off a face this wide
 
 
 class Surface:
-    """Distance to a head, from the nearest of its vertices and triangle centres."""
+    """Distance to a head without its ears, from the nearest of its vertices and triangle centres."""
 
     def __init__(self, head: HeadMeasures) -> None:
         from scipy.spatial import cKDTree
 
-        faces = head.faces[head.outer[head.faces].all(1)]
-        centres, normals = head.vertices[faces].mean(1), head.normals[faces].mean(1)
+        open_, plugs = _without_ears(head)
+        faces = head.faces[open_[head.faces].all(1)]
         used = np.zeros(len(head.vertices), bool)
         used[faces] = True
-        points = np.concatenate([head.vertices[used], centres])
-        normals = np.concatenate([head.normals[used], normals])
+        points = np.concatenate([head.vertices[used], head.vertices[faces].mean(1), *plugs])
+        sideways = [np.tile([np.sign(plug[0, 0]), 0.0, 0.0], (len(plug), 1)) for plug in plugs]
+        normals = np.concatenate([head.normals[used], head.normals[faces].mean(1), *sideways])
         keep = np.isfinite(points).all(1) & (np.linalg.norm(normals, axis=1) > 0.5)
         self._points, self._normals = points[keep], normals[keep]
         self._tree = cKDTree(self._points, balanced_tree=False, compact_nodes=False)
@@ -47,7 +50,32 @@ class Surface:
     def push_out(self, points: np.ndarray, margin: float = MARGIN) -> np.ndarray:
         """The points [..., 3], those within `margin` of the head moved out."""
         distance, normals = self.near(points)
-        return points + np.maximum(margin - distance, 0)[..., None] * normals
+        out = points + np.clip(margin - distance, 0, PUSH_MOST)[..., None] * normals
+        deep = distance < margin - PUSH_MOST
+        if deep.any():
+            distance, normals = self.near(out[deep])
+            out[deep] += np.clip(margin - distance, 0, PUSH_MOST)[:, None] * normals
+        return out
+
+
+def _without_ears(head: HeadMeasures) -> tuple[np.ndarray, list[np.ndarray]]:
+    """bool[V] of the skin around the ears, and points [N, 3] that close each of the holes."""
+    open_, plugs = head.outer.copy(), []
+    for side in (1, -1):
+        ear = head.vertices[head.ears & (side * head.vertices[:, 0] > 0)]
+        if not len(ear):
+            continue
+        middle, reach = (ear.min(0) + ear.max(0)) / 2, 0.55 * np.ptp(ear, 0) + 1e-3
+        r2 = (((head.vertices - middle)[:, 1:] / reach[1:]) ** 2).sum(1)
+        beside = side * head.vertices[:, 0] > 0.5 * side * middle[0]
+        rim = head.outer & ~head.ears & beside & (r2 > 1) & (r2 < 1.8)
+        open_ &= ~(beside & (r2 <= 1)) & ~head.ears
+        grid = np.stack(np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 17)), -1).reshape(-1, 2)
+        grid = grid[(grid**2).sum(1) < 1]
+        width = np.median(np.abs(head.vertices[rim, 0])) if rim.any() else np.abs(ear[:, 0]).min()
+        x = side * (width + EAR_DOME * (1 - (grid**2).sum(1)))
+        plugs.append(np.column_stack([x, middle[1:] + grid * reach[1:]]))
+    return open_, plugs
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +106,7 @@ class Comb:
         before = _ramp(points[:, 2] - head.eyes[2], -0.035, 0.0) * _ramp(head.height(points), 0.66, 0.5)
         before = before * _ramp(np.abs(points[:, 0]), FACE_HALF + 0.03, FACE_HALF)
         side = np.where(points[:, 0] > 0, 1.0, -1.0)
-        return before[:, None] * np.stack([2.5 * side, 0 * side, 0 * side - 2.0], 1)
+        return before[:, None] * np.stack([1.6 * side, 0 * side - 0.5, 0 * side - 1.2], 1)
 
 
 def strand_lengths(
@@ -111,8 +139,8 @@ def grow(
     """Strands [K, P, 3] m from roots [K, 3] with skin normals [K, 3]."""
     lengths = strand_lengths(head, style, roots, rng)
     strands = _comb(head, surface, style, roots, normals, lengths, rng)
-    strands = _gather(strands, roots, style, rng)
     strands = _curl(strands, lengths, style, rng)
+    strands = _gather(strands, roots, style, rng)
     strands = _frizz(strands, style, rng)
     body = surface.push_out(strands[:, 1:])
     return np.concatenate([roots[:, None], body], 1)
@@ -128,7 +156,8 @@ def _comb(head, surface, style, roots, normals, lengths, rng):
     )
     layer = np.minimum(layer, 0.8 * lengths)
     lean = rng.normal(0, 0.10, (count, 3))
-    points, heading, travelled = roots.copy(), normals.copy(), np.zeros((count, 1))
+    points, travelled = roots.copy(), np.zeros((count, 1))
+    heading = _unit(0.6 * normals + comb.direction(roots, roots))
     strands = [roots]
     for _ in range(style.points - 1):
         for _ in range(SUBSTEPS):
@@ -137,14 +166,16 @@ def _comb(head, surface, style, roots, normals, lengths, rng):
             loose = _ramp(distance, 0.02, 0.06)[:, None]
             flow = flow - (flow * normal).sum(1, keepdims=True) * normal * (1 - loose)
             flow = _unit(flow) * (1 - 0.9 * loose)
-            wanted = layer * (1 - np.exp(-travelled[:, 0] / (1.5 * style.lift + 1e-6)))
+            wanted = layer * (1 - np.exp(-travelled[:, 0] / (0.7 * style.lift + 1e-6)))
             rise = np.clip((wanted + 0.2 * layer - distance) / np.maximum(style.lift, 4e-3), -0.8, 1.5)[
                 :, None
             ]
-            pull = style.gravity * (1 + 2 * loose) * np.array([0.0, -1.0, 0.0])
-            heading = _unit(0.9 * heading + 0.55 * (flow + pull + rise * (1 - loose) * normal))
+            rise = rise * (1 - loose)
+            pull = style.gravity * (1 + 4 * loose) * np.array([0.0, -1.0, 0.0])
+            heading = _unit((0.9 - 0.35 * loose) * heading + 0.55 * (flow + pull + rise * normal))
             points = points + step * heading
-            points = points + np.maximum(MARGIN - surface.near(points)[0], 0)[:, None] * normal
+            left = distance + step[:, 0] * (heading * normal).sum(1)
+            points = points + np.clip(MARGIN - left, 0, PUSH_MOST)[:, None] * normal
             travelled = travelled + step
         strands.append(points)
     return np.stack(strands, 1)
@@ -184,7 +215,7 @@ def _frizz(strands: np.ndarray, style: HairStyle, rng: np.random.Generator) -> n
     """Smooth displacements of single strands; a few fly off."""
     count, points = strands.shape[:2]
     along = np.linspace(0, 1, points)
-    amount = style.frizz * rng.gamma(1.2, 0.8, count) * np.where(rng.random(count) < 0.03, 2.5, 1)
+    amount = style.frizz * rng.gamma(2, 0.4, count) * np.where(rng.random(count) < 0.01, 2, 1)
     bend, sway = rng.normal(0, 0.6, (2, count, 1, 3))
     wave = np.sin(np.pi * along * rng.uniform(0.8, 2.5, (count, 1)))[..., None]
     return strands + amount[:, None, None] * (bend * along[:, None] ** 1.5 + sway * wave * along[:, None])

@@ -12,12 +12,13 @@ from cap4d.synth.hair.face import FrontView, brow_lines, grow_brows, grow_lashes
 from cap4d.synth.hair.growth import Surface, grow
 from cap4d.synth.hair.occlusion import openness
 from cap4d.synth.hair.scalp import HeadMeasures, Roots, measure_head, sample_roots, scalp_density
-from cap4d.synth.hair.style import draw_color, draw_style
+from cap4d.synth.hair.style import HairStyle, draw_color, draw_style
 
 BALD_POINTS = 6  # of a strand when there are only eyebrows and lashes
 REAL_STRANDS = 100_000  # on a head: how many the drawn ones stand for, for their shadows
 ROOT_HOLD = 0.02  # m along a strand over which it lets go of its patch of skin and follows the skull
 HAIR_WIDTH = 2.2e-4  # m, of a drawn strand, which stands for several
+BROW_BRIGHTEST = 0.36  # of sRGB: fair people's eyebrows are darker than their hair
 DARK = 0.66  # of the skin's brightness: what a rig has painted darker on the scalp is taken for hair
 
 
@@ -61,7 +62,7 @@ class Hair:
 
     def turn(self, vertices: np.ndarray) -> np.ndarray:
         """[3, 3] the skull's rotation from the neutral head to `vertices` [V, 3]."""
-        return _best_rotation(self.neutral[self.skull], np.asarray(vertices, np.float64)[self.skull])
+        return best_rotation(self.neutral[self.skull], np.asarray(vertices, np.float64)[self.skull])
 
     def pose(self, vertices: np.ndarray) -> np.ndarray:
         """The strands on posed vertices [V, 3], in the frame of these (any right-handed one).
@@ -97,16 +98,15 @@ class Hair:
         rotation = after @ before.swapaxes(-1, -2)
         lost = np.abs(np.linalg.det(rotation) - 1) > 1e-3  # of triangles without area
         rotation[lost] = turn
-        offsets = self.strands[self.skin] - self.strands[self.skin, :1]
+        offsets = self.strands[self.skin] - roots.on(self.neutral)[:, None]
         return roots.on(vertices)[:, None] + offsets @ rotation.swapaxes(-1, -2)
 
     def shade_scalp(self, colors: np.ndarray) -> np.ndarray:
         """sRGB albedo [V, 3] of the mesh with the skin under the hair tinted, painted hair taken away."""
         colors = np.array(colors, np.float64)
-        bare = self.painted & (self.scalp < 1)
-        if self.painted.any():
-            colors[bare] = skin_tone(colors, self.painted)
-        under = 0.5 * self.color + 0.02
+        tone = skin_tone(colors, self.painted | (self.brow > 0))
+        colors[self.painted] = tone
+        under = 0.6 * self.color + 0.1 * tone
         tint = np.maximum(0.92 * self.scalp, 0.35 * self.brow)[:, None]
         return colors * (1 - tint) + tint * under
 
@@ -116,7 +116,9 @@ def skin_tone(colors: np.ndarray, painted: np.ndarray) -> np.ndarray:
     return np.median(colors[~painted], 0) if (~painted).any() else np.median(colors, 0)
 
 
-def grow_hair(rig: HeadRig, neutral: np.ndarray, *, seed: int, style: str | None = None) -> Hair:
+def grow_hair(
+    rig: HeadRig, neutral: np.ndarray, *, seed: int, style: str | None = None, density: float = 1.0
+) -> Hair:
     """Hair, eyebrows and lashes for a subject's neutral head.
 
     Args:
@@ -124,23 +126,31 @@ def grow_hair(rig: HeadRig, neutral: np.ndarray, *, seed: int, style: str | None
         neutral: [V, 3] m, rig axes.
         seed: Same seed, same hair.
         style: A name of `style.STYLES`; None draws one.
+        density: Multiplies the number of strands.
     Raises:
         ArgumentError: No such style.
     """
     rng = np.random.default_rng([seed, 0x4A1])
     chosen, color = draw_style(rng, style), draw_color(rng)
     head = measure_head(rig, neutral)
-    density = scalp_density(head, raised=chosen.raised) if chosen.count else np.zeros(len(head.vertices))
-    if chosen.crown < 1:
-        bare = np.clip((head.height(head.vertices) - 0.35) / 0.2, 0, 1)
-        density = density * (1 - (1 - chosen.crown) * bare)
-    surface = Surface(head)
-    roots = sample_roots(head, density, chosen.count, rng, _outer_faces(rig, head))
+    cover, surface = _cover(rig, head, chosen), Surface(head)
+    roots = sample_roots(head, cover, round(chosen.count * density), rng, _outer_faces(rig, head))
     points = chosen.points if len(roots.bary) else BALD_POINTS
     strands = np.zeros((0, points, 3))
     if len(roots.bary):
         strands = grow(head, surface, chosen, roots.on(head.vertices), roots.on(head.normals), rng)
-    return _finish(rig, head, surface, chosen.name, (roots, strands), density, color, rng)
+    return _finish(rig, head, surface, chosen.name, (roots, strands), cover, color, rng)
+
+
+def _cover(rig: HeadRig, head: HeadMeasures, style: HairStyle) -> np.ndarray:
+    """[V] share of the full density of hair over each vertex."""
+    if not style.count:
+        return np.zeros(len(head.vertices))
+    cover = scalp_density(head, raised=style.raised)
+    if style.raised == 0:
+        cover[rig.regions.get("hair", [])] = 1
+    bare = np.clip((head.height(head.vertices) - 0.35) / 0.2, 0, 1)
+    return cover * (1 - (1 - style.crown) * bare)
 
 
 def _outer_faces(rig: HeadRig, head: HeadMeasures) -> np.ndarray:
@@ -153,7 +163,7 @@ def _outer_faces(rig: HeadRig, head: HeadMeasures) -> np.ndarray:
     return faces[modelled[faces].all(1)]
 
 
-def _finish(rig, head, surface, name, scalp, density, color, rng) -> Hair:
+def _finish(rig, head, surface, name, scalp, cover, color, rng) -> Hair:
     """Adds the face's hair, colours and shadows."""
     view, points = FrontView(head, head.faces), scalp[1].shape[1]
     lines = brow_lines(rig, head)
@@ -175,7 +185,7 @@ def _finish(rig, head, surface, name, scalp, density, color, rng) -> Hair:
         through=through,
         neutral=head.vertices,
         skull=_skull(head),
-        scalp=density.astype(np.float32),
+        scalp=cover.astype(np.float32),
         brow=_brow_cover(head, lines),
         painted=_painted(rig, head),
         shadow=shadow,
@@ -200,15 +210,20 @@ def _shadows(scalp, strands, head: HeadMeasures, surface: Surface) -> tuple[np.n
 def _colors(strands: np.ndarray, kind: np.ndarray, color: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """float32[K, P, 3]: strands differ, roots are darker than tips; brows and lashes are darker than hair."""
     count, points = strands.shape[:2]
-    tone = np.exp(rng.normal(0, 0.16, (count, 1, 1))) * np.exp(rng.normal(0, 0.03, (count, 1, 3)))
+    locks = np.sin(strands[:, 0] @ rng.normal(0, 160, (3, 3)) + rng.uniform(0, 6, 3)).mean(1)
+    tone = np.exp(rng.normal(0, 0.16, count) + 0.16 * locks)[:, None, None]
+    tone = tone * np.exp(rng.normal(0, 0.03, (count, 1, 3)))
     along = np.linspace(0, 1, points)[None, :, None]
-    fair = np.array([1.0, 0.62, 0.4])[kind][:, None, None]
-    return np.clip(color * tone * (0.82 + 0.3 * along) * fair + 0.01, 0, 1).astype(np.float32)
+    grey = np.full(3, color.mean())
+    face = 0.6 * (0.6 * color + 0.4 * grey * [1.15, 1.0, 0.85])
+    face = face * min(1, BROW_BRIGHTEST / face.max())
+    base = np.stack([color, face, 0.3 * face])[kind][:, None]
+    return np.clip(base * tone * (0.82 + 0.3 * along) + 0.01, 0, 1).astype(np.float32)
 
 
 def _widths(strands: np.ndarray, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     along = np.linspace(0, 1, strands.shape[1])
-    width = HAIR_WIDTH * np.array([1.0, 0.9, 0.8])[kind] * rng.uniform(0.7, 1.3, len(strands))
+    width = HAIR_WIDTH * np.array([1.0, 0.75, 0.55])[kind] * rng.uniform(0.7, 1.3, len(strands))
     return (width[:, None] * np.interp(along, [0, 0.6, 1], [1, 1, 0.3])).astype(np.float32)
 
 
@@ -239,10 +254,15 @@ def _painted(rig: HeadRig, head: HeadMeasures) -> np.ndarray:
     tone = np.median(light[face]) if face.any() else np.median(light)
     where = (head.height(head.vertices) > 0.13) | (head.angle(head.vertices) > 50)
     high = head.height(head.vertices) > -0.9
-    dark = light < DARK * tone
+    on_scalp = (head.height(head.vertices) > 0.42) | (head.angle(head.vertices) > 50)
+    dark = light < np.where(on_scalp, 0.9, DARK) * tone
     if "hair" in rig.regions:
         dark[rig.regions["hair"]] = True
-    return head.outer & where & high & dark
+    painted = head.outer & where & high & dark
+    for _ in range(2):  # what is painted fades out over a few triangles
+        touched = head.faces[painted[head.faces].any(1)]
+        painted[touched] = True
+    return painted & head.outer
 
 
 def _frames(corners: np.ndarray) -> np.ndarray:
@@ -253,7 +273,7 @@ def _frames(corners: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], -1)
 
 
-def _best_rotation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def best_rotation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """[3, 3] the rotation that best takes points [S, 3] to others (Kabsch 1976)."""
     u, _, vt = np.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
     flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])

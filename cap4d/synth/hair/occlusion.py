@@ -1,4 +1,4 @@
-"""How much light reaches each place in a head of hair, from a few directions: deep opacity on a coarse grid."""
+"""How much light reaches each place in a head of hair, from a few sides: deep opacity on a coarse grid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 CELL = 0.005  # m
 REACH = 26  # cells that a ray is followed
 STRAND_WIDTH = 9e-5  # m; of the hair that shades, not of what is drawn
-EXTINCTION = 0.55  # share of the geometric coverage that takes light away: the rest is scattered on
+EXTINCTION = 0.3  # share of the geometric coverage that takes light away: the rest is scattered on
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 3**0.5
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3), _CORNERS])
 """[D, 3] unit, in the head's own axes (the rig's)."""
@@ -59,13 +59,20 @@ def openness(strands: np.ndarray, share: float, solid) -> Openness:
     cell = np.floor((middle - low) / CELL).astype(int)
     flat = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
     density = np.bincount(flat, length, size.prod()) * share * STRAND_WIDTH / CELL**2 * EXTINCTION
-    near = np.argwhere(_grown(density.reshape(size) > 0))
+    density = _blurred(density.reshape(size))
+    near = np.argwhere(_grown(density > 0))
     blocked = solid(low + (near + 0.5) * CELL)
-    dense = density.reshape(size).astype(np.float32)
+    dense = density.astype(np.float32)
     dense[tuple(near[blocked].T)] = 3.0
     through = np.ones((*size, len(DIRECTIONS)), np.float32)
     through[tuple(near.T)] = _march(dense, near)
     return Openness(low, through)
+
+
+def _blurred(values: np.ndarray) -> np.ndarray:
+    for axis in range(3):
+        values = 0.5 * values + 0.25 * (np.roll(values, 1, axis) + np.roll(values, -1, axis))
+    return values
 
 
 def _grown(filled: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Where hair grows on a head: measures of a neutral head, the hairline, and roots on its triangles.
 
-Found from the eyes, the top of the skull and the ears alone, so that it holds for every rig. Rig axes, metres.
+Found from the eyes, the top of the skull and the ears alone, so that it holds for every rig. Rig axes, m.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def _ears(rig: HeadRig, vertices: np.ndarray, head: np.ndarray, eyes: np.ndarray
     for side in (1, -1):
         tip = vertices[near][np.argmax(side * vertices[near, 0])]
         reach = ((vertices[:, 1:] - tip[1:] + [0.012, 0]) / EAR_REACH) ** 2
-        ears |= head & (reach.sum(1) < 1) & (side * vertices[:, 0] > 0.8 * side * tip[0])
+        ears |= head & (reach.sum(1) < 1) & (side * vertices[:, 0] > 0.86 * side * tip[0])
     return ears
 
 
@@ -135,7 +135,7 @@ class Roots:
 def sample_roots(
     head: HeadMeasures, density: np.ndarray, count: int, rng: np.random.Generator, faces: np.ndarray
 ) -> Roots:
-    """`count` random roots on triangles `faces` [F, 3], as dense as `density` [V] says; none where it is 0."""
+    """`count` random roots on triangles `faces` [F, 3], as dense as `density` [V] says."""
     a, b, c = (head.vertices[faces[:, i]] for i in range(3))
     weight = np.linalg.norm(np.cross(b - a, c - a), axis=1) * density[faces].mean(1)
     if not weight.sum() > 0 or count < 1:

@@ -46,7 +46,7 @@ class HairStyle:
     wavelength: float = 0.05
     clump: float = 0.35
     clumps: int = 900
-    frizz: float = 0.003
+    frizz: float = 0.002
     raised: float = 0.0
     crown: float = 1.0
 
@@ -61,9 +61,11 @@ STYLES = {
         HairStyle("side-part", top=0.075, side=0.022, lift=0.014, part=0.03, sweep=(0, 0, -0.3), points=14),
         HairStyle("swept-back", top=0.10, side=0.05, lift=0.013, sweep=(0, 0, -1.5), points=14, gravity=0.2),
         HairStyle("fringe", top=0.09, side=0.06, lift=0.013, sweep=(0, 0, 0.6), fringe=0.27, points=14),
-        HairStyle("bob", top=0.2, side=0.2, lift=0.017, part=0.02, cut=-0.75, points=18, gravity=0.6),
-        HairStyle("long", top=0.3, side=0.3, lift=0.016, part=0.0, cut=-1.7, points=20, gravity=0.6),
-        HairStyle("curly", top=0.07, side=0.035, lift=0.028, wave=0.006, wavelength=0.022, points=20),
+        HairStyle("bob", count=11000, top=0.2, side=0.2, lift=0.017, part=0.02, cut=-0.75, gravity=0.6),
+        HairStyle("long", count=9000, top=0.3, side=0.3, lift=0.016, part=0.0, cut=-1.7, gravity=0.6),
+        HairStyle(
+            "curly", 14000, 22, 0.075, 0.04, 0.028, wave=0.008, wavelength=0.026, clump=0.8, clumps=420
+        ),
         HairStyle("receding", top=0.03, side=0.015, lift=0.009, raised=0.20, crown=0.5, sweep=(0, 0, -0.4)),
         HairStyle("horseshoe", count=9000, top=0.012, side=0.014, lift=0.007, raised=0.1, crown=0.0),
     )
@@ -84,16 +86,16 @@ WEIGHTS = {
 }
 # sRGB of a lit strand, and how often it is met.
 COLORS = {
-    "black": ((0.075, 0.062, 0.058), 0.24),
-    "dark brown": ((0.155, 0.108, 0.082), 0.26),
-    "brown": ((0.255, 0.172, 0.118), 0.18),
+    "black": ((0.12, 0.103, 0.098), 0.24),
+    "dark brown": ((0.19, 0.135, 0.10), 0.26),
+    "brown": ((0.30, 0.205, 0.14), 0.18),
     "light brown": ((0.39, 0.275, 0.18), 0.09),
-    "dark blond": ((0.53, 0.41, 0.27), 0.07),
-    "blond": ((0.73, 0.60, 0.41), 0.05),
+    "dark blond": ((0.56, 0.42, 0.285), 0.07),
+    "blond": ((0.78, 0.61, 0.42), 0.05),
     "red": ((0.44, 0.20, 0.095), 0.03),
     "grey": ((0.50, 0.49, 0.48), 0.04),
     "white": ((0.80, 0.79, 0.77), 0.02),
-    "dyed": ((0.25, 0.16, 0.42), 0.02),
+    "dyed": ((0.34, 0.20, 0.46), 0.02),
 }
 
 
