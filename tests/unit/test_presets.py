@@ -61,7 +61,7 @@ def test_densification(released):
 
 def test_losses(released):
     w, p = released.weights, released.perceptual
-    assert (w.l1, w.dssim, w.matte) == (0.6, 0.4, 0.0)  # fact 33
+    assert (w.l1, w.dssim, w.l2, w.matte) == (0.6, 0.4, 0.0, 0.0)  # fact 33
     assert (p.kind, p.weight, p.most, p.image_range) == ("lpips", 0.1, 0.9, "fixed")
     assert (w.position, w.position_limit, w.scale, w.scale_limit) == (1e-3, 2.0, 1.0, 1.0)  # fact 34
     assert (w.laplacian, w.deformation, w.rotation, w.pose) == (1.0, 0.4, 0.005, 1.0)  # fact 35
