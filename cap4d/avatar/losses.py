@@ -26,6 +26,7 @@ class LossWeights:
 
     Args:
         l1, dssim: Photometric mixture, 0.6 L1 + 0.4 (1 - SSIM).
+        l2: Mean squared error beside it, which turns first to what is far off. 0 in the released system.
         matte: L1 of the rendered coverage against the matte; without it white Gaussians may stand in for
             background.
         position, position_limit: Local means beyond the limit (face sizes).
@@ -38,6 +39,7 @@ class LossWeights:
 
     l1: float = 0.6
     dssim: float = 0.4
+    l2: float = 0.0
     matte: float = 0.1
     position: float = 1e-3
     position_limit: float = 2.0
@@ -100,12 +102,16 @@ def gradient_distance(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor
 
 
 def photometric(image: torch.Tensor, target: torch.Tensor, weights: LossWeights) -> torch.Tensor:
-    """0.6 L1 + 0.4 (1 - SSIM) of two [H, W, 3] images in [0, 1] (fact 33 without its LPIPS)."""
+    """0.6 L1 + 0.4 (1 - SSIM) of two [H, W, 3] images in [0, 1] (fact 33 without its LPIPS).
+
+    And as much of their mean squared error as the weights say.
+    """
     if image.device.type == "cpu" and image.dtype == target.dtype == torch.float32:
         absolute, similar = l1_and_ssim(image, target)
     else:
         absolute, similar = (image - target).abs().mean(), ssim_map(image, target).mean()
-    return weights.l1 * absolute + weights.dssim * (1 - similar)
+    loss = weights.l1 * absolute + weights.dssim * (1 - similar)
+    return loss if weights.l2 == 0 else loss + weights.l2 * (image - target).square().mean()
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -175,11 +175,14 @@ def initial_counts(rig: HeadRig, grid: UvGrid, *, gaussians: int, per_face: int)
     """int64[M] Gaussians per triangle: by area on the template, at least `per_face` (fact 29).
 
     On the rig's own triangles those few that each has anyway are part of the budget: a rig may have more of
-    them than a UV grid, and would otherwise begin with more Gaussians.
+    them than a UV grid, and would otherwise begin with more Gaussians. Without a floor the triangles that get
+    none are spread evenly over the others.
     """
     corners = remesh(rig, grid).template.astype(np.float64)[grid.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     shares = areas / areas.sum()
+    if per_face == 0:
+        return np.diff(np.floor(np.cumsum(gaussians * shares) + 0.5), prepend=0).astype(np.int64)
     counts = _counts(shares, gaussians, per_face)
     if not grid.is_mesh or counts.sum() <= gaussians:
         return counts
@@ -200,12 +203,15 @@ def initial_gaussians(
 ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Fact 29: means in [0, 0.4)^3, scale 1 / count of the face, opacity 0.1, grey.
 
+    Where there are fewer Gaussians than faces they are larger, so that they cover those that have none.
     Returns:
         The raw local Gaussians and their binding int32[N], in the order of the faces.
     """
     binding = torch.repeat_interleave(torch.arange(len(counts)), torch.from_numpy(counts))
     n = len(binding)
     scale = 1 / torch.from_numpy(counts)[binding].float()
+    if (counts == 0).any():
+        scale *= max(1.0, (len(counts) / n) ** 0.5)
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
     gaussians = {

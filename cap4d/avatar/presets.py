@@ -162,7 +162,8 @@ class Choices:
         lpips_range: `fixed` shows LPIPS images in [-1, 1], for which it was made; `compat` in [0, 1] as the
             released code (fact 33).
         split_offset: See `Densify`.
-        per_face: See `Preset`.
+        per_face: See `Preset`. Without a floor, Gaussians may also grow larger than their triangle, to cover
+            those that have none.
         prune: `opacity` takes out faint Gaussians alone, `contribution` those as well that the training views
             would miss least.
     """
@@ -181,7 +182,11 @@ class Choices:
         if self.prune is not None:
             densify = replace(densify, prune_least=PRUNE_LEAST if self.prune == "contribution" else 0.0)
         per_face = preset.per_face if self.per_face is None else self.per_face
-        return replace(preset, densify=densify, per_face=per_face, perceptual=self._perceptual(preset))
+        weights = preset.weights
+        if per_face == 0:
+            weights = replace(weights, scale_limit=SPARSE_SCALE_LIMIT)
+        chosen = {"densify": densify, "per_face": per_face, "weights": weights}
+        return replace(preset, perceptual=self._perceptual(preset), **chosen)
 
     def _perceptual(self, preset: Preset) -> Perceptual:
         perceptual = preset.perceptual
@@ -193,6 +198,7 @@ class Choices:
 
 
 PRUNE_LEAST = 0.05
+SPARSE_SCALE_LIMIT = 3.0
 
 # released and paper ---------------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ HELD_OUT = """held-out frames (every 10th and the last tenth of a video, or thos
 trained on; their expressions and poses come from the tracker, which sees all frames."""
 
 RECIPE = """released: the constants of the released CAP4D code; paper: the paper's, where it differs; short:
-for CPUs; auto: released where torch finds a CUDA device, short elsewhere (default: auto)"""
+for CPUs; auto: released with a CUDA device and gsplat, short elsewhere (default: auto)"""
 
 
 def add(commands) -> None:
@@ -164,6 +164,8 @@ def recipe_of(name: str) -> str:
     """`auto` becomes `released` or `short`."""
     if name != "auto":
         return name
+    from importlib.util import find_spec
+
     import torch
 
-    return "released" if torch.cuda.is_available() else "short"
+    return "released" if torch.cuda.is_available() and find_spec("gsplat") is not None else "short"

@@ -147,6 +147,7 @@ def test_the_command_line_chooses(capture, hub, monkeypatch):
     expected = Choices(split_offset="local", per_face=0).applied(preset_named("low", "released"))
     assert (seen["preset"], seen["ablate"]) == (expected, "lpips")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name == "gsplat" or None)
     main([*base, "--lpips-weights", str(hub), "--perceptual", "gradient", "--prune", "contribution"])
     expected = Choices(perceptual="gradient", prune="contribution").applied(preset_named("low", "released"))
     assert (seen["preset"], seen["lpips_weights"]) == (expected, hub)

@@ -48,6 +48,8 @@ def test_ssim_map_and_photometric():
     weights = LossWeights()
     by_hand = 0.6 * np.abs(x.numpy() - y.numpy()).mean() + 0.4 * (1 - expected.mean())
     assert abs(float(losses.photometric(x, y, weights)) - by_hand) < 1e-12
+    squared = float(losses.photometric(x, y, LossWeights(l2=5.0))) - by_hand
+    assert abs(squared - 5 * np.square(x.numpy() - y.numpy()).mean()) < 1e-12
 
 
 def test_ssim_away_from_the_border_is_that_of_the_evaluation():
