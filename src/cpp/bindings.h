@@ -12,4 +12,5 @@ void register_similarity(pybind11::module_& m);
 void register_sort(pybind11::module_& m);
 void register_splatter(pybind11::module_& m);
 void register_unet(pybind11::module_& m);
+void register_unet_training(pybind11::module_& m);
 }  // namespace cap4d

@@ -12,4 +12,5 @@ PYBIND11_MODULE(_core, m) {
   cap4d::register_sort(m);
   cap4d::register_splatter(m);
   cap4d::register_unet(m);
+  cap4d::register_unet_training(m);
 }
