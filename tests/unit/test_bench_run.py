@@ -134,7 +134,7 @@ def test_a_quick_run_prints_lines_without_verdicts(report: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (["--only", "splat,nonsense"], 2, "only: expected names of"),
+        (["--only", "splat,nonsense"], 2, "sections: expected names of"),
         (["--only", ""], 2, "got nothing"),
         (["--threads", "0"], 2, "threads: expected 1 to 256"),
         (["--scenes", "nowhere"], 2, "scenes: expected a folder"),
