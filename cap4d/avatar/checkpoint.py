@@ -30,7 +30,7 @@ def previous_of(path: Path) -> Path:
 
 
 def save_checkpoint(state: dict[str, Any], path: Path) -> None:
-    """Writes `state` through a temporary file and a rename, and keeps the one that was there as the previous."""
+    """Writes `state` through a temporary file and a rename; what was there becomes the previous one."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     payload = buffer.getvalue()
