@@ -15,7 +15,7 @@ def add(commands) -> None:
         "bench",
         run_bench,
         "measure speed against error, and write a report",
-        "cap4d bench fit --report bench",
+        "cap4d bench --report bench --avatar me.cap4d",
         more="Splatter, fitting step, deformer and whole frames, beside the machine's ceilings and peers.",
     )
     parser.add_argument(
