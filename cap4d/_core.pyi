@@ -136,12 +136,34 @@ def rasterize_vjp(
     """Gradients of means, quats, scales, opacities, sh and means2d."""
 
 def similarity(image: _F32, target: _F32, threads: int = 0) -> tuple[float, float, _F32]:
-    """Two images [H, W, C] -> mean absolute difference, mean SSIM, and [3, H, W, C] that the gradient needs."""
+    """Two images [H, W, C] -> mean absolute difference, mean SSIM, [3, H, W, C] that the gradient needs."""
 
 def similarity_vjp(
     image: _F32, target: _F32, partials: _F32, v_absolute: float, v_structural: float, threads: int = 0
 ) -> _F32:
     """Gradient [H, W, C] of the image from those of `similarity`'s two means."""
+
+_Layers = list[tuple[_F32, _F32]]
+
+@final
+class UnetPass:
+    """The deformation network there and back, for fitting; what the way back needs stays in it.
+
+    The same bits for any number of threads. Not for several threads at once.
+    """
+
+    def __init__(self, width: int, batch: int, encoding: _F32) -> None:
+        """encoding [C, S, S]: what the first layer sees behind the offsets. ValueError: a size is wrong."""
+    @property
+    def size(self) -> int: ...
+    @property
+    def batch(self) -> int: ...
+    @property
+    def depth(self) -> int: ...
+    def forward(self, offsets: _F32, down: _Layers, up: _Layers, threads: int = 0) -> _F32:
+        """offsets [B, 3, S, S], weights and biases, the outermost first -> answer [B, 3, S, S]."""
+    def backward(self, v_out: _F32, threads: int = 0) -> tuple[_Layers, _Layers]:
+        """Gradients of all weights and biases, after `forward`."""
 
 class _Unet:
     def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:

@@ -8,12 +8,15 @@ import torch
 from torch import Tensor
 
 from cap4d import _core
+from cap4d.bind import bind, triangle_frames
 
 
 def bind_to(
     vertices: Tensor, faces: Tensor, *, means: Tensor, quats: Tensor, log_scales: Tensor, binding: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`bind(triangle_frames(vertices, faces), ...)` of cap4d.bind, fact 27, on the CPU in float32.
+    """`bind(triangle_frames(vertices, faces), ...)` of cap4d.bind, fact 27: in C++ on the CPU.
+
+    Elsewhere with torch's own gradients, of frames in double as in C++.
 
     Args:
         vertices: float32[G, 3] m.
@@ -24,7 +27,17 @@ def bind_to(
         means [N, 3] m, quats [N, 4], scales [N, 3] m. Triangles without area give no gradient to their
         frames.
     """
-    return _Bind.apply(vertices, means, quats, log_scales, faces, binding)
+    if vertices.device.type == "cpu":
+        return _Bind.apply(vertices, means, quats, log_scales, faces, binding)
+    return bind_in_torch(vertices, faces, means=means, quats=quats, log_scales=log_scales, binding=binding)
+
+
+def bind_in_torch(
+    vertices: Tensor, faces: Tensor, *, means: Tensor, quats: Tensor, log_scales: Tensor, binding: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`bind_to` on any device. The gradient of a triangle without area is finite, but may be large."""
+    frames = tuple(x.to(means.dtype) for x in triangle_frames(vertices.double(), faces.long()))
+    return bind(frames, means=means, quats=quats, log_scales=log_scales, binding=binding.long())
 
 
 class _Bind(torch.autograd.Function):

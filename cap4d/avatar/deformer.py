@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from cap4d.avatar.fast_deformer import FastDeformer
+
 DEFORM_STD = (
     0.0108  # m; offsets are divided by it on the way in, the output is multiplied by it (facts 20, 23)
 )
@@ -42,12 +44,21 @@ class Deformer(nn.Module):
         mask = torch.from_numpy(np.ascontiguousarray(valid, np.float32))
         self.register_buffer("mask", mask, persistent=False)
         self.register_buffer("encoding", positional_encoding(size), persistent=False)
+        self._fast: FastDeformer | None = None
         self._initialise(generator)
 
     def forward(self, offsets: torch.Tensor) -> torch.Tensor:
         scaled = offsets * (self.mask / DEFORM_STD)
+        if _is_fast(scaled, self.encoding):
+            return self._run_fast(scaled) * DEFORM_STD
         encoding = self.encoding.expand(len(offsets), -1, -1, -1)
         return self.model(torch.cat([scaled, encoding], 1)) * DEFORM_STD
+
+    def _run_fast(self, scaled: torch.Tensor) -> torch.Tensor:
+        if self._fast is None:
+            self._fast = FastDeformer(self.width, self.encoding)
+        down, up = self.model.tensors()
+        return self._fast(scaled, down, up)
 
     def _initialise(self, generator: torch.Generator | None) -> None:
         """N(0, 0.02) weights, zero biases, and a zero last layer (fact 23)."""
@@ -107,9 +118,27 @@ class _Level(nn.Module):
             skip=True,
         )
 
+    def tensors(self) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+        """Weights and biases in turns on the way down, and on the way up; the outermost layer first."""
+        below = next((layer for layer in self.model if isinstance(layer, _Level)), None)
+        down, up = ([], []) if below is None else below.tensors()
+        halving, doubling = (
+            [layer.weight, layer.bias]
+            for kind in (nn.Conv2d, nn.ConvTranspose2d)
+            for layer in self.model
+            if isinstance(layer, kind)
+        )
+        return [*halving, *down], [*doubling, *up]
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         y = self.model(x)
         return torch.cat([x, y], 1) if self.skip else y
+
+
+def _is_fast(offsets: torch.Tensor, encoding: torch.Tensor) -> bool:
+    """Whether the C++ network can take them: float32 on the CPU, and no gradient is asked of the offsets."""
+    plain = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in (offsets, encoding))
+    return plain and not offsets.requires_grad and not torch.onnx.is_in_onnx_export()
 
 
 def positional_encoding(size: int) -> torch.Tensor:

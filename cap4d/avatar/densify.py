@@ -29,8 +29,8 @@ class Evidence:
         radius: [N] largest radius on screen, px.
     """
 
-    def __init__(self, n: int) -> None:
-        self.gradient, self.seen, self.radius = torch.zeros(n), torch.zeros(n), torch.zeros(n)
+    def __init__(self, n: int, device: torch.device | None = None) -> None:
+        self.gradient, self.seen, self.radius = (torch.zeros(n, device=device) for _ in range(3))
 
     def add(self, v_means2d: torch.Tensor, radii: torch.Tensor) -> None:
         """Adds one view: dL/d(means2d) [N, 2] and radii [N], 0 where not visible."""
@@ -134,7 +134,7 @@ def reset_opacity(rows: Rows) -> None:
 
 def _least(worth: torch.Tensor | None, share: float, n: int) -> torch.Tensor:
     """bool[N]: the share that is worth least; none where nothing is known."""
-    chosen = torch.zeros(n, dtype=torch.bool)
+    chosen = torch.zeros(n, dtype=torch.bool, device=None if worth is None else worth.device)
     if worth is not None and share > 0:
         chosen[worth.topk(int(share * n), largest=False).indices] = True
     return chosen
@@ -168,7 +168,7 @@ def _split(
     # `chosen` speaks of the rows before cloning appended to them.
     index = chosen.nonzero()[:, 0].repeat(CHILDREN)
     children = {name: value.detach()[index].clone() for name, value in rows.model.gaussians.items()}
-    noise = torch.randn(len(index), 3, generator=generator) * children["log_scales"].exp()
+    noise = torch.randn(len(index), 3, generator=generator).to(index.device) * children["log_scales"].exp()
     if offset_sizes is not None:
         noise *= offset_sizes[rows.model.binding[index], None]
     children["means"] += (quat_to_rotmat(children["quats"]) @ noise[:, :, None])[:, :, 0]
@@ -182,8 +182,9 @@ def _last_of_their_face(doomed: torch.Tensor, model: AvatarModel, faces: int) ->
     at_risk = (doomed & (survivors[model.binding] == 0)).nonzero()[:, 0]
     opacity = model.gaussians["opacity_logits"].detach()[at_risk]
     order = at_risk[torch.sort(opacity, stable=True).indices]
-    rank = torch.full((faces,), -1).scatter_reduce(
-        0, model.binding[order].long(), torch.arange(len(order)), "amax"
+    place = torch.arange(len(order), device=order.device)
+    rank = torch.full((faces,), -1, device=order.device).scatter_reduce(
+        0, model.binding[order].long(), place, "amax"
     )
     saved = torch.zeros_like(doomed)
     saved[order[rank[rank >= 0]]] = True

@@ -1,7 +1,7 @@
 """Fitting an avatar to captures of a person: the loop around the trainer, and the files it leaves.
 
 Beside `me.cap4d` stand `me.fit.json` (numbers), `me.fit.png` (held-out frames: truth, ours, nearest training
-frame) and, while the fit runs, `me.fit.ckpt`.
+frame) and, while the fit runs, `me.fit.ckpt` and the one before it, `me.fit.ckpt.previous`.
 """
 
 from __future__ import annotations
@@ -9,21 +9,24 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from cap4d.avatar.checkpoint import load_checkpoint, save_checkpoint
+from cap4d.avatar.checkpoint import load_latest, remove_checkpoints, save_checkpoint
 from cap4d.avatar.corrections import corrections_named
+from cap4d.avatar.device import device_named
 from cap4d.avatar.losses import Distance, Perceptual, gradient_distance
 from cap4d.avatar.model import create_avatar
 from cap4d.avatar.paint import paint
+from cap4d.avatar.pause import pausing
 from cap4d.avatar.presets import Preset, preset_named
 from cap4d.avatar.references import Selection, select, split_selected
-from cap4d.avatar.report import FitReport, compare, summarise, write_sheet
+from cap4d.avatar.report import FitReport, compare, peak_memory_mb, summarise, write_sheet
 from cap4d.avatar.trainer import Trainer
 from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, split_views, spread
 from cap4d.camera import opencv_from_rig
@@ -40,6 +43,19 @@ PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
 
 
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """What takes time is in C++ with threads of its own; torch's only wait for more work on its cores, and
+    sum in an order that depends on their number.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def fit(
     captures: Sequence[Path],
     rig: HeadRig,
@@ -52,6 +68,7 @@ def fit(
     lpips_weights: Path | None = None,
     references: Sequence[tuple[str, int]] | None = None,
     hold_out: Sequence[str] = (),
+    device: str = "auto",
 ) -> FitReport:
     """Fits an avatar and writes it, its report and its picture.
 
@@ -70,6 +87,7 @@ def fit(
         references: (camera, frame) of the images of the first capture to train on; None: all that are not
             held out.
         hold_out: Cameras of the first capture that are never trained on.
+        device: `auto`, `cpu` or `cuda` (see `device_named`).
     Raises:
         ArgumentError: An unknown preset or ablation, or no frame to train on.
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
@@ -81,9 +99,10 @@ def fit(
     if not output.parent.is_dir() or output.is_dir():
         raise ArgumentError(f"output: expected a file in a folder that exists, got {output}")
     settings = preset_named(preset) if isinstance(preset, str) else preset
+    place = device_named(device)
     if ablate == "lpips":
         settings = replace(settings, perceptual=Perceptual())
-    perceptual = distance_of(settings.perceptual, lpips_weights)
+    perceptual = distance_of(settings.perceptual, lpips_weights, place)
     started = time.monotonic()
     loaded = [Capture.load(path) for path in captures]
     for capture in loaded:
@@ -96,25 +115,42 @@ def fit(
     left_out = "" if perceptual or settings.perceptual.kind == "none" else ", without LPIPS"
     kind = f"preset {settings.name}{left_out}, rig {rig.name}, ablate {ablate}, seed {seed}, data {data}"
     spent = 0.0
-    if resume and checkpoint.exists():
-        state = load_checkpoint(checkpoint, kind=kind)
+    state = load_latest(checkpoint, kind=kind) if resume else None
+    if state is not None:
         trainer.restore(state["trainer"])
         spent = state["seconds"]
         log.info("%s: going on at step %d", checkpoint, trainer.step)
+    trainer.move(place)
+
+    def seconds() -> float:
+        return spent + time.monotonic() - started
 
     def save() -> None:
-        seconds = spent + time.monotonic() - started
-        save_checkpoint({"kind": kind, "trainer": trainer.state(), "seconds": seconds}, checkpoint)
+        save_checkpoint({"kind": kind, "trainer": trainer.state(), "seconds": seconds()}, checkpoint)
 
-    log.info("fitting %d frames, %d held out; %s", len(split.train), len(split.held_out), settings.name)
-    run(trainer, save)
+    log.info("%s", outlook(trainer, split, place))
+    pace = run(trainer, save)
+    trainer.move(torch.device("cpu"))
     report = finish(
-        trainer, loaded, split, rig, output, ablate=ablate, seconds=lambda: spent + time.monotonic() - started
+        trainer, loaded, split, rig, output, ablate=ablate, seconds=seconds, pace=pace, device=place
     )
-    checkpoint.unlink(missing_ok=True)
+    remove_checkpoints(checkpoint)
     return report
 
 
+def outlook(trainer: Trainer, split: Split, device: torch.device) -> str:
+    """`fitting 80 images up to 256x256, 20 held out: preset low, recipe short, 2500 steps, on cpu`"""
+    preset = trainer.preset
+    width, height = (max(getattr(v.camera, side) for v in split.train) for side in ("width", "height"))
+    recipe = f", recipe {preset.recipe}" if getattr(preset, "recipe", None) else ""
+    return (
+        f"fitting {len(split.train)} images up to {width}x{height}, {len(split.held_out)} held out: "
+        f"preset {preset.name}{recipe}, {preset.iterations} steps from {trainer.step}, "
+        f"{len(trainer.model)} Gaussians, on {device.type}"
+    )
+
+
+@one_torch_thread()
 def prepare(
     captures: Sequence[Capture],
     split: Split,
@@ -149,7 +185,9 @@ def prepare(
     return Trainer(model, corrections, split.train, preset, seed=seed, perceptual=perceptual)
 
 
-def distance_of(perceptual: Perceptual, weights: Path | None) -> Distance | None:
+def distance_of(
+    perceptual: Perceptual, weights: Path | None, device: torch.device | None = None
+) -> Distance | None:
     """What a perceptual term compares [0, 1] images by; None without one, or without the weights it needs.
 
     Raises:
@@ -161,7 +199,7 @@ def distance_of(perceptual: Perceptual, weights: Path | None) -> Distance | None
     if files is None:
         log.warning("the fit goes on without its LPIPS term: %s", LPIPS_NEEDS)
         return None
-    network = load_lpips(files)
+    network = load_lpips(files).to(device)
     if perceptual.image_range == "compat":
         return network
     return lambda image, target: network(2 * image - 1, 2 * target - 1)
@@ -182,27 +220,44 @@ def fingerprint(captures: Sequence[Path], settings: Preset, selection: Selection
     return digest.hexdigest()[:12]
 
 
-def run(trainer: Trainer, save) -> None:
-    """Steps to the end, saying where it is every few seconds and saving now and then."""
+@one_torch_thread()
+def run(trainer: Trainer, save: Callable[[], None]) -> float:
+    """Steps to the end, saying where it is every few seconds and saving now and then.
+
+    Returns:
+        Mean time of a step, s.
+    Raises:
+        KeyboardInterrupt: Ctrl-C; the step it came in is finished and saved.
+    """
     preset = trainer.preset
     begun, first = time.monotonic(), trainer.step
-    spoke, losses = begun, []
-    while trainer.step < preset.iterations:
-        losses.append(trainer.advance())
-        now = time.monotonic()
-        if now - spoke > REPORT_SECONDS or trainer.step == preset.iterations:
+    spoke, losses, pace = begun, [], 0.0
+    with pausing() as pause:
+        while trainer.step < preset.iterations:
+            losses.append(trainer.advance())
+            now = time.monotonic()
             pace = (now - begun) / (trainer.step - first)
-            log.info(
-                "step %d/%d  loss %.4f  %d Gaussians  %.0f ms a step  %s left",
-                *(trainer.step, preset.iterations, float(np.mean(losses)), len(trainer.model), 1e3 * pace),
-                duration((preset.iterations - trainer.step) * pace),
-            )
-            spoke, losses = now, []
-        if trainer.step % preset.checkpoint_every == 0:
-            save()
+            if now - spoke > REPORT_SECONDS or trainer.step == preset.iterations:
+                log.info("%s", progress(trainer, float(np.mean(losses)), pace))
+                spoke, losses = now, []
+            if pause.asked or trainer.step % preset.checkpoint_every == 0:
+                save()
+            if pause.asked:
+                log.info("stopped after step %d: the same command with --resume goes on", trainer.step)
+                raise KeyboardInterrupt
+    return pace
 
 
-def finish(trainer, captures, split, rig, output: Path, *, ablate, seconds) -> FitReport:
+def progress(trainer: Trainer, loss: float, pace: float) -> str:
+    """Where a fit is; `pace` in seconds a step."""
+    return (
+        f"step {trainer.step}/{trainer.preset.iterations}  loss {loss:.4f}  {len(trainer.model)} Gaussians  "
+        f"{1e3 * pace:.0f} ms a step  {peak_memory_mb():.0f} MB  "
+        f"{duration((trainer.preset.iterations - trainer.step) * pace)} left"
+    )
+
+
+def finish(trainer, captures, split, rig, output: Path, *, ablate, seconds, pace, device) -> FitReport:
     """Compares with the held-out frames and writes avatar, numbers and picture."""
     from cap4d.export.bundle import export_bundle
 
@@ -211,7 +266,8 @@ def finish(trainer, captures, split, rig, output: Path, *, ablate, seconds) -> F
     export_bundle(trainer.model, output, rig=rig, capture=captures[0], clip=clip)
     if comparison is not None:
         write_sheet(comparison, output.with_suffix(".fit.png"))
-    report = summarise(comparison, trainer, split, ablate=ablate, seconds=seconds())
+    times = {"seconds": seconds(), "step_ms": 1e3 * pace}
+    report = summarise(comparison, trainer, split, ablate=ablate, device=device.type, **times)
     report.write(output.with_suffix(".fit.json"))
     _announce(report, output)
     return report
@@ -219,11 +275,8 @@ def finish(trainer, captures, split, rig, output: Path, *, ablate, seconds) -> F
 
 def _announce(report: FitReport, output: Path) -> None:
     log.info(
-        "%s: %d Gaussians, %s, %.0f MB",
-        output,
-        report.gaussians,
-        duration(report.seconds),
-        report.peak_memory_mb,
+        "%s: %d Gaussians, %s, %.0f ms a step, %.0f MB",
+        *(output, report.gaussians, duration(report.seconds), report.step_ms, report.peak_memory_mb),
     )
     if report.held_out_psnr is not None:
         log.info(

@@ -5,7 +5,9 @@ Everything is in the head-fixed frame, OpenCV axes, metres; the head's pose is i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -100,6 +102,12 @@ class AvatarModel(nn.Module):
         self.register_buffer("binding", binding)
         self.register_buffer("faces", torch.from_numpy(grid.faces), persistent=False)
         self.register_buffer("deformable", torch.from_numpy(grid.deformable)[:, None], persistent=False)
+
+    def _apply(
+        self, function: Callable[[torch.Tensor], torch.Tensor], *args: Any, **options: Any
+    ) -> AvatarModel:
+        self.subject = self.subject.map(function)  # not a module, but goes where the module goes
+        return super()._apply(function, *args, **options)
 
     def __len__(self) -> int:
         """Gaussians."""

@@ -41,6 +41,8 @@ class FitReport:
             for those after the last training frame.
         train_psnr: Pooled over some training frames.
         seconds: Wall time of the fit.
+        step_ms: Mean wall time of a step, of those since the last resume.
+        device: `cpu` or `cuda`.
         peak_memory_mb: Greatest resident memory of the process.
     """
 
@@ -60,6 +62,8 @@ class FitReport:
     tail: dict[str, float]
     train_psnr: float
     seconds: float
+    step_ms: float
+    device: str
     peak_memory_mb: float
 
     def write(self, path: Path) -> None:
@@ -139,7 +143,14 @@ def _baselines(view: FitView, train: Sequence[FitView]) -> tuple[np.ndarray, np.
 
 
 def summarise(
-    comparison: Comparison | None, trainer: Trainer, split: Split, *, ablate: str | None, seconds: float
+    comparison: Comparison | None,
+    trainer: Trainer,
+    split: Split,
+    *,
+    ablate: str | None,
+    seconds: float,
+    step_ms: float,
+    device: str,
 ) -> FitReport:
     """Puts the report together; `comparison` is None where nothing is held out."""
     everything = between = tail = {}
@@ -163,6 +174,8 @@ def summarise(
         tail=tail,
         train_psnr=pooled_psnr(train_errors),
         seconds=round(seconds, 1),
+        step_ms=round(step_ms, 1),
+        device=device,
         peak_memory_mb=round(peak_memory_mb(), 1),
     )
 

@@ -31,6 +31,7 @@ from cap4d.avatar.worth import removal_errors
 from cap4d.bind import triangle_frames
 from cap4d.camera import opencv_from_rig
 from cap4d.raster import Rasterized, rasterize
+from cap4d.raster.rasterize import Backend
 
 WHITE = (1.0, 1.0, 1.0)
 ADAM_EPS = 1e-15  # fact 36; gradients of a mean over pixels are tiny
@@ -47,6 +48,7 @@ class Trainer:
         preset: Schedule, rates and weights.
         seed: Of the order of views and of densification.
         perceptual: What `preset.perceptual` compares images by; None leaves the term out.
+        backend: Of `rasterize`.
     """
 
     def __init__(
@@ -58,16 +60,34 @@ class Trainer:
         *,
         seed: int,
         perceptual: Distance | None = None,
+        backend: Backend = "auto",
     ) -> None:
+        self.backend = backend
         self.model, self.preset, self.views, self.seed = model, preset, views, seed
         self.corrections, self.perceptual = nn.ModuleList(corrections), perceptual
         self.step = 0
-        self.evidence = Evidence(len(model))
+        self.evidence = Evidence(len(model), self.device)
         self.optimizer = _optimizer(model, self.corrections, preset)
         self.rows = Rows(model, self.optimizer)
         neutral = opencv_from_rig(model.subject.neutral)
         self.faces = model.faces.long()
         self.face_sizes = triangle_frames(neutral, self.faces)[2]
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is but the views."""
+        return self.model.binding.device
+
+    def move(self, device: torch.device) -> None:
+        """Takes everything that a step touches to a device."""
+        if device == self.device:
+            return
+        state = self.state()
+        self.model.to(device)
+        self.corrections.to(device)
+        self.views = [view.to(device) for view in self.views]
+        self.faces, self.face_sizes = self.faces.to(device), self.face_sizes.to(device)
+        self.restore(state)
 
     def advance(self) -> float:
         """Takes one step and returns its loss."""
@@ -99,6 +119,7 @@ class Trainer:
             camera=view.camera,
             background=WHITE,
             sh_degree=self.sh_degree,
+            backend=self.backend,
         )
         return posed, rendered
 
@@ -107,7 +128,7 @@ class Trainer:
         pose = seen = corrected.pose
         if noise > 0:
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
-            jitter = noise * torch.randn(pose.expr.shape, generator=generator)
+            jitter = noise * torch.randn(pose.expr.shape, generator=generator).to(pose.expr)
             seen = replace(pose, expr=pose.expr.detach() + jitter)
         return self.model.pose(pose, rigid=corrected.rigid, network_pose=seen)
 
@@ -159,7 +180,7 @@ class Trainer:
                 generator=generator,
                 worth=self._worth(generator) if d.prune_least > 0 else None,
             )
-            self.evidence = Evidence(len(self.model))
+            self.evidence = Evidence(len(self.model), self.device)
         if d.resets_at(self.step):
             reset_opacity(self.rows)
 
@@ -205,16 +226,18 @@ class Trainer:
         """Takes up a `state`. Its sizes must be those of this trainer but for the number of Gaussians."""
         self.step = state["step"]
         for name, value in state["gaussians"].items():
-            self.model.gaussians[name] = nn.Parameter(value)
-        self.model.binding = state["binding"]
+            self.model.gaussians[name] = nn.Parameter(value.to(self.device))
+        self.model.binding = state["binding"].to(self.device)
         if self.model.deformer is not None:
             self.model.deformer.load_state_dict(state["deformer"])
         self.corrections.load_state_dict(state["corrections"])
         self.optimizer = _optimizer(self.model, self.corrections, self.preset)
         self.optimizer.load_state_dict(state["optimizer"])
         self.rows = Rows(self.model, self.optimizer)
-        self.evidence = Evidence(len(self.model))
-        self.evidence.gradient, self.evidence.seen, self.evidence.radius = state["evidence"]
+        self.evidence = Evidence(len(self.model), self.device)
+        self.evidence.gradient, self.evidence.seen, self.evidence.radius = (
+            x.to(self.device) for x in state["evidence"]
+        )
 
 
 def rotation_term(

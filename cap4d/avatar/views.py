@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -42,6 +42,11 @@ class FitView:
     def target(self) -> torch.Tensor:
         """float32[H, W, 3]."""
         return self.pixels.float()
+
+    def to(self, device: torch.device) -> FitView:
+        """The same with its images on a device."""
+        coverage = None if self.coverage is None else self.coverage.to(device)
+        return replace(self, pixels=self.pixels.to(device), coverage=coverage)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,12 @@ def add(commands) -> None:
         more="Splatter, fitting step, deformer and whole frames, beside the machine's ceilings and peers.",
     )
     parser.add_argument(
+        "sections",
+        nargs="*",
+        metavar="SECTION",
+        help="some of ceilings splat fit deformer frame optimize peers (default: all)",
+    )
+    parser.add_argument(
         "--report",
         type=Path,
         default=Path("bench"),
@@ -42,7 +48,7 @@ def add(commands) -> None:
     parser.add_argument(
         "--only",
         metavar="SECTIONS",
-        help="some of ceilings,splat,fit,deformer,frame,optimize,peers (default: all)",
+        help="the same, with commas",
     )
     parser.add_argument("--threads", type=int, default=2, metavar="N", help="of everything (default: 2)")
     parser.add_argument("--quick", action="store_true", help="small and short: to see that it runs")
@@ -56,8 +62,12 @@ def run_bench(arguments: argparse.Namespace) -> None:
 
     if not 1 <= arguments.threads <= 256:
         raise ArgumentError(f"threads: expected 1 to 256, got {arguments.threads}")
+    named = " ".join(arguments.sections)
+    if named and arguments.only is not None:
+        raise ArgumentError("sections: expected them by name or in --only, got both")
+    wanted = named if named else arguments.only
     settings = Settings(
-        sections=SECTIONS if arguments.only is None else parse_sections(arguments.only),
+        sections=SECTIONS if wanted is None else parse_sections(wanted),
         threads=arguments.threads,
         quick=arguments.quick,
         avatars=tuple(arguments.avatar),

@@ -58,6 +58,12 @@ def add(commands) -> None:
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="same seed, same machine: same avatar (default: 0)"
     )
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "cuda"),
+        help="auto: a CUDA device where torch finds one and gsplat is installed (default: auto)",
+    )
     _add_choices(parser)
 
 
@@ -157,6 +163,7 @@ def run_fit(arguments: argparse.Namespace) -> None:
         lpips_weights=arguments.lpips_weights,
         references=chosen_references(arguments, rig, hold_out),
         hold_out=hold_out,
+        device=arguments.device,
     )
 
 

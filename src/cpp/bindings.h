@@ -14,4 +14,5 @@ void register_sort(pybind11::module_& m);
 void register_splatter(pybind11::module_& m);
 void register_strands(pybind11::module_& m);
 void register_unet(pybind11::module_& m);
+void register_unet_training(pybind11::module_& m);
 }  // namespace cap4d

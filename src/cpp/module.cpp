@@ -14,4 +14,5 @@ PYBIND11_MODULE(_core, m) {
   cap4d::register_splatter(m);
   cap4d::register_strands(m);
   cap4d::register_unet(m);
+  cap4d::register_unet_training(m);
 }

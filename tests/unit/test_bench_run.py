@@ -86,6 +86,13 @@ def test_all_steps_of_adam_are_the_same(report: Path) -> None:
     assert all(step["difference"] < 1e-6 for step in fit["steps"])
 
 
+def test_forward_and_backward_stand_beside_gsplat(report: Path) -> None:
+    found = json.loads((report / "out" / "report.json").read_text())["fit"]["iteration"]
+    assert (found["gaussians"], found["size"]) == (1_000, [128, 128])
+    assert found["rows"][0]["name"] == "ours" and found["rows"][0]["ratio"] == 1
+    assert all(row["median_ms"] > 0 and row["memory_mb"] >= 0 for row in found["rows"])
+
+
 def test_the_avatar_is_measured_in_each_of_its_tiers(report: Path) -> None:
     found = json.loads((report / "out" / "report.json").read_text())
     deformer, frame = found["deformer"][0], found["frame"][0]
@@ -135,8 +142,10 @@ def test_a_quick_run_prints_lines_without_verdicts(report: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (["--only", "splat,nonsense"], 2, "only: expected names of"),
+        (["--only", "splat,nonsense"], 2, "sections: expected names of"),
         (["--only", ""], 2, "got nothing"),
+        (["nonsense"], 2, "sections: expected names of"),
+        (["fit", "--only", "splat"], 2, "got both"),
         (["--threads", "0"], 2, "threads: expected 1 to 256"),
         (["--scenes", "nowhere"], 2, "scenes: expected a folder"),
         (["--scenes", "."], 1, "cameras.json"),
@@ -167,7 +176,7 @@ def test_help_has_an_example(capsys: pytest.CaptureFixture) -> None:
 
 
 def test_sections_are_names_with_commas() -> None:
-    assert parse_sections("splat, fit") == ("splat", "fit")
+    assert parse_sections("splat, fit") == parse_sections("splat fit") == ("splat", "fit")
     with pytest.raises(ArgumentError):
         parse_sections("everything")
 

@@ -61,10 +61,17 @@ def frame_task(**arguments: Any) -> dict[str, Any]:
     return memory_alone(**arguments)
 
 
+def iteration_task(**arguments: Any) -> dict[str, Any]:
+    from cap4d.evaluate.bench.iteration import memory_alone
+
+    return memory_alone(**arguments)
+
+
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "splat": splat_task,
     "memory": memory_task,
     "frame": frame_task,
+    "iteration": iteration_task,
 }
 
 

@@ -69,7 +69,7 @@ def find_peers(scene: Scene, settings: Settings) -> tuple[dict[str, Peer], list[
     """The peers that can run here, and a line for each that cannot."""
     makers = {
         "NumPy, float32, tile by tile": _numpy_peer,
-        "gsplat's PyTorch functions, pairs given": _gsplat_peer,
+        "gsplat's PyTorch functions, pairs given": gsplat_peer,
     }
     peers, missing = {}, []
     for name, make in makers.items():
@@ -109,7 +109,12 @@ def _numpy_peer(scene: Scene, settings: Settings) -> Peer:
     return Peer(lambda: render_tiled(scene.gaussians, scene.camera, dtype=np.float32).rgb)
 
 
-def _gsplat_peer(scene: Scene, settings: Settings) -> Peer:
+def gsplat_peer(scene: Scene, settings: Settings) -> Peer:
+    """gsplat's readable functions on the CPU.
+
+    Raises:
+        ModuleNotFoundError: gsplat or nerfacc is not installed.
+    """
     torch = importlib.import_module("torch")
     functions = importlib.import_module("gsplat.cuda._torch_impl")
     importlib.import_module("nerfacc")

@@ -14,6 +14,7 @@ from cap4d.evaluate.bench.ceilings import Ceilings, measure_ceilings
 from cap4d.evaluate.bench.deforming import measure_deformer
 from cap4d.evaluate.bench.fitting import measure_fitting
 from cap4d.evaluate.bench.frames import measure_frames
+from cap4d.evaluate.bench.iteration import measure_iteration
 from cap4d.evaluate.bench.machine import describe_machine
 from cap4d.evaluate.bench.passes import lanes
 from cap4d.evaluate.bench.peers import measure_peers
@@ -90,6 +91,8 @@ def measure_sections(
     if "fit" in settings.sections:
         report["fit"] = measure_fitting(settings, ceilings[settings.threads])
         missing += report["fit"].pop("not_measured")
+        report["fit"]["iteration"] = measure_iteration(source, settings)
+        missing += report["fit"]["iteration"].pop("not_measured")
     for name, measure in (("deformer", measure_deformer), ("frame", measure_frames)):
         if name in settings.sections and settings.avatars:
             report[name] = [measure(path, settings) for path in settings.avatars]
@@ -153,25 +156,24 @@ def prepare_folder(folder: Path) -> None:
 
 
 def parse_sections(text: str) -> tuple[str, ...]:
-    """`splat,fit` -> ("splat", "fit")
+    """`splat,fit` -> ("splat", "fit"); spaces may stand for commas.
 
     Raises:
         ArgumentError: One of them is not a section.
     """
-    wanted = tuple(name.strip() for name in text.split(","))
+    wanted = tuple(name.strip() for name in text.replace(" ", ",").split(",") if name.strip()) or ("",)
     for name in wanted:
         if name not in SECTIONS:
-            raise ArgumentError(f"only: expected names of {', '.join(SECTIONS)}, got {name or 'nothing'}")
+            raise ArgumentError(f"sections: expected names of {', '.join(SECTIONS)}, got {name or 'nothing'}")
     return wanted
 
 
 def command(folder: Path, settings: Settings) -> str:
     """The command line that does the same again."""
-    words = ["cap4d", "bench", "--report", str(folder), "--threads", str(settings.threads)]
+    sections = () if settings.sections == SECTIONS else settings.sections
+    words = ["cap4d", "bench", *sections, "--report", str(folder), "--threads", str(settings.threads)]
     if settings.scenes is not None:
         words += ["--scenes", str(settings.scenes)]
     if settings.avatars:
         words += ["--avatar", *map(str, settings.avatars)]
-    if settings.sections != SECTIONS:
-        words += ["--only", ",".join(settings.sections)]
     return shlex.join([*words, *["--quick"] * settings.quick])

@@ -138,6 +138,17 @@ def fit(found: Report) -> Iterator[str]:
     yield ""
     rows = ((s["name"], s["median_ms"], s["p95_ms"], s["difference"]) for s in found["steps"])
     yield from table(("step", "median", "p95", "largest difference from torch after 10 steps"), rows)
+    if "iteration" in found:
+        yield from _iteration(found["iteration"])
+
+
+def _iteration(found: Report) -> Iterator[str]:
+    width, height = found["size"]
+    yield f"Forward and backward of {found['gaussians']:,} Gaussians ({found['scene']}) at {width}x{height};"
+    yield "times in turns, memory on top of the scene's own, each in a process of its own."
+    yield ""
+    rows = ((r["name"], r["median_ms"], r["p95_ms"], r["ratio"], r["memory_mb"]) for r in found["rows"])
+    yield from table(("forward + backward", "median", "p95", "x ours", "memory, MB"), rows)
 
 
 def deformer(avatars: list[Report]) -> Iterator[str]:

@@ -111,6 +111,22 @@ def fitting_shows(fit: dict[str, Any]) -> Iterator[Show]:
             f"as the plain one; {fit['floor_ms']:.2f} ms if every byte came from memory",
             fused <= SCATTER * plain,
         )
+    if "iteration" in fit:
+        yield from _iteration_shows(fit["iteration"])
+
+
+def _iteration_shows(found: dict[str, Any]) -> Iterator[Show]:
+    ours, *others = found["rows"]
+    width, height = found["size"]
+    what = f"forward + backward, {found['gaussians']:,} Gaussians, {width}x{height}"
+    yield Show(1, f"{what}: {ours['median_ms']:.1f} ms, {_megabytes(ours)}", None)
+    for other in others:
+        theirs = f"{other['name']}: {other['median_ms']:.1f} ms, {_megabytes(other)}"
+        yield Show(1, f"{what}, {theirs}; x{other['ratio']:.1f} ours", other["ratio"] > 1)
+
+
+def _megabytes(row: dict[str, Any]) -> str:
+    return "memory not measured" if row["memory_mb"] is None else f"{row['memory_mb']:.0f} MB"
 
 
 def deformer_shows(avatar: dict[str, Any]) -> Iterator[Show]:
