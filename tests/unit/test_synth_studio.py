@@ -98,7 +98,10 @@ def test_depth_is_along_the_cameras_axis(person):
 
 def test_deviations_vanish_at_rest_and_leave_the_eyes_alone(builtin_rig):
     subject = builtin_rig.subject()
-    rest, expr = np.zeros(builtin_rig.n_expressions, np.float32), np.full(builtin_rig.n_expressions, 0.4, np.float32)
+    rest, expr = (
+        np.zeros(builtin_rig.n_expressions, np.float32),
+        np.full(builtin_rig.n_expressions, 0.4, np.float32),
+    )
     turns = {"eye_rot": np.float32([0.1, 0.1, 0]), "neck_rot": np.float32([0, 0.1, 0])}
     own = draw_body(builtin_rig, subject, np.random.default_rng(1), 1.0)
     exact = draw_body(builtin_rig, subject, np.random.default_rng(1), 0.0)
@@ -159,7 +162,7 @@ def test_noise_is_bounded_smooth_and_seeded():
     assert np.abs(_core.gradient_noise(points + np.float32(1e-3), 7) - value).max() < 0.02
     assert np.abs(_core.gradient_noise(points, 8) - value).max() > 0.5
     distance, own = _core.cellular_noise(points, 7)
-    assert 0 <= distance.min() and distance.max() < 1.8 and 0 <= own.min() and own.max() < 1
+    assert distance.min() >= 0 and distance.max() < 1.8 and own.min() >= 0 and own.max() < 1
     assert _core.gradient_noise(np.float32([[np.inf, np.nan, 1e30]]), 1).shape == (1,)
 
 
@@ -172,7 +175,9 @@ def test_light_surface_refuses_what_it_would_read_beyond(person, name, monkeypat
         arrays = {"face": face, "faces": faces, "uv_faces": uv_faces, "uvs": rest[6]}
         arrays[name] = np.array(arrays[name])
         arrays[name].ravel()[0] = np.nan if name == "uvs" else 10**9
-        return true(arrays["face"], bary, arrays["faces"], arrays["uv_faces"], *rest[:6], arrays["uvs"], *rest[7:])
+        return true(
+            arrays["face"], bary, arrays["faces"], arrays["uv_faces"], *rest[:6], arrays["uvs"], *rest[7:]
+        )
 
     monkeypatch.setattr(_core, "light_surface", spoiled)
     with pytest.raises(ValueError, match=name):
