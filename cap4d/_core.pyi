@@ -135,6 +135,14 @@ def rasterize_vjp(
 ) -> tuple[_F32, _F32, _F32, _F32, _F32, _F32]:
     """Gradients of means, quats, scales, opacities, sh and means2d."""
 
+def similarity(image: _F32, target: _F32, threads: int = 0) -> tuple[float, float, _F32]:
+    """Two images [H, W, C] -> mean absolute difference, mean SSIM, and [3, H, W, C] that the gradient needs."""
+
+def similarity_vjp(
+    image: _F32, target: _F32, partials: _F32, v_absolute: float, v_structural: float, threads: int = 0
+) -> _F32:
+    """Gradient [H, W, C] of the image from those of `similarity`'s two means."""
+
 class _Unet:
     def __init__(self, tensors: Mapping[str, NDArray[np.generic]], size: int) -> None:
         """For a grid of `size` px. ValueError: a tensor is missing, or of a wrong dtype or shape."""

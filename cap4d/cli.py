@@ -11,7 +11,22 @@ import logging
 import sys
 from collections.abc import Sequence
 
-from cap4d.commands import bench, demo, drive, fit, inspect, optimize, render, rig, synth, track
+from cap4d.commands import (
+    bench,
+    demo,
+    drive,
+    evaluate,
+    export,
+    fit,
+    import_,
+    inspect,
+    optimize,
+    protocol,
+    render,
+    rig,
+    synth,
+    track,
+)
 from cap4d.errors import exit_code
 from cap4d.parser import OneLineParser
 
@@ -43,7 +58,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--version", action="version", version=f"cap4d {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for room in (demo, rig, synth, track, fit, optimize, render, drive, inspect, bench):
+    making = (demo, rig, track, synth, fit, import_, optimize)
+    using = (render, drive, export, inspect, evaluate, protocol, bench)
+    for room in making + using:
         room.add(commands)
     return parser
 

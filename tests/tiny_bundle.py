@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from cap4d.bundle import Bundle
@@ -10,7 +12,7 @@ from cap4d.drive.clip import Clip
 from cap4d.gaussians import SH_COUNTS
 from cap4d.player.deformer import Deformer
 from cap4d.player.png import encode_png
-from cap4d.rig.grid import UvGrid
+from cap4d.rig.grid import UvGrid, mesh_grid
 from cap4d.rig.head import Subject
 
 RIG_NAME = "tiny"
@@ -170,4 +172,24 @@ def tiny_bundle(
         idle=tiny_clip(seed=seed),
         preview=encode_png(np.full((8, 8, 3), 200, np.uint8)),
         mesh_subject=ball if mesh else None,
+    )
+
+
+def tiny_bundle_on_mesh(size: int = 16, *, gaussians: int = 3, seed: int = 0) -> Bundle:
+    """A playable bundle whose Gaussians ride on the ball's own triangles, without a network."""
+    whole, ball = tiny_bundle(size, gaussians=1, seed=seed, network=False), tiny_mesh(size, seed=seed)
+    at = np.arange(size * size).reshape(size, size)
+    a, b, c, d = at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]
+    faces = np.concatenate([np.stack(corners, -1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))])
+    binding = np.repeat(np.arange(len(faces), dtype=np.int32), gaussians)
+    taken = np.resize(np.arange(len(whole)), len(binding))
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    return replace(
+        whole,
+        **{name: getattr(whole, name)[taken] for name in names},
+        grid=mesh_grid(faces, len(ball.neutral)),
+        subject=ball,
+        mesh_subject=ball,
+        deform_neutral=np.zeros_like(ball.neutral),
+        binding=binding,
     )

@@ -13,6 +13,7 @@ from cap4d.app.overlays.legend import Legend, rounded_up, ticks
 from cap4d.app.overlays.surface_pass import SurfacePass
 from cap4d.app.renderers import Renderer
 
+from cap4d.bundle.bundle import Bundle
 from cap4d.camera import Camera
 from cap4d.player.avatar import Avatar
 
@@ -35,8 +36,17 @@ class Part(StrEnum):
     EXPRESSION = "expression"
 
 
+def why_not(overlay: Overlay, bundle: Bundle) -> str:
+    """Why an avatar has nothing for an overlay to show, or nothing."""
+    if bundle.grid.is_mesh and overlay is Overlay.UV:
+        return "This avatar's Gaussians ride on the rig's own triangles: it has no UV grid"
+    if bundle.grid.is_mesh and overlay is Overlay.DEFORMATION:
+        return "This avatar has no network: nothing but the rig moves it"
+    return ""
+
+
 class Overlays:
-    """Draws what is in `shown`. What was never shown costs nothing.
+    """Draws what is in `shown`, if the avatar has it. What was never shown costs nothing.
 
     Args:
         ctx: OpenGL 4.1 or newer.
@@ -64,7 +74,7 @@ class Overlays:
             camera: Of that picture; for a sharper surface, the same view `resized` to the framebuffer.
             upright: As of `Backdrop.draw`.
         """
-        if not self.shown:
+        if not self._showing():
             return
         screen, viewport = self.ctx.fbo, self.ctx.viewport
         counts = self._counted(renderer)
@@ -82,7 +92,7 @@ class Overlays:
         found = []
         if Overlay.DENSITY in self.shown and self._density is not None:
             found.append(self._density.legend)
-        if Overlay.DEFORMATION in self.shown:
+        if Overlay.DEFORMATION in self._showing():
             title = "Deformation, mm" if self.part is Part.ALL else "Deformation by expression, mm"
             found.append(Legend(title, self._colors, ticks(self.limits_mm[self.part] or 1.0)))
         return found
@@ -94,6 +104,9 @@ class Overlays:
             moved -= self.avatar.bundle.deform_neutral
         return 1e3 * np.linalg.norm(moved, axis=1)
 
+    def _showing(self) -> set[Overlay]:
+        return {overlay for overlay in self.shown if not why_not(overlay, self.avatar.bundle)}
+
     def _counted(self, renderer: Renderer) -> moderngl.Texture | None:
         if Overlay.DENSITY not in self.shown:
             return None
@@ -101,16 +114,17 @@ class Overlays:
         return self._density.counts(renderer)
 
     def _drawn(self, vertices: np.ndarray, camera: Camera) -> moderngl.Texture | None:
-        if not self.shown - {Overlay.DENSITY}:
+        showing = self._showing()
+        if not showing - {Overlay.DENSITY}:
             return None
         self._surface = self._surface or SurfacePass(self.ctx, self.avatar.bundle.grid)
         self._surface.begin(vertices, camera)
-        if Overlay.DEFORMATION in self.shown:
+        if Overlay.DEFORMATION in showing:
             self._draw_deformation(self._surface)
-        if Overlay.UV in self.shown:
+        if Overlay.UV in showing:
             self._surface.draw("overlay_uv", uniforms={"grid_size": float(self._surface.grid_size)})
-        if Overlay.MESH in self.shown:
-            self._surface.draw("overlay_mesh")
+        if Overlay.MESH in showing:
+            self._surface.draw("overlay_wire" if self.avatar.bundle.grid.is_mesh else "overlay_mesh")
         return self._surface.end()
 
     def _draw_deformation(self, surface: SurfacePass) -> None:

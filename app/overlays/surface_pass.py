@@ -14,6 +14,7 @@ from cap4d.camera import NEAR, Camera
 from cap4d.rig.grid import UvGrid
 
 FAR = 100.0  # m
+TRIANGLE = ((0, 0), (1, 0), (1, 1))  # rows and columns of a mesh's triangle; see overlay_wire.frag
 SAMPLES = 4  # per pixel, so that the surface's outline is as smooth as its lines; twice the time on a CPU
 
 
@@ -32,10 +33,15 @@ class SurfacePass:
         wanted = (0 if is_software(ctx) else SAMPLES) if samples is None else samples
         self._samples = min(wanted, ctx.max_samples)
         self._target = self._resolved = None
-        self._positions = ctx.buffer(reserve=12 * len(grid), dynamic=True)
-        self._values = ctx.buffer(bytes(4 * len(grid)), dynamic=True)
-        self._pixels = ctx.buffer(np.ascontiguousarray(grid.pixels, np.float32))
-        self._faces = ctx.buffer(np.ascontiguousarray(grid.faces, np.uint32))
+        # Triangles of a mesh share no corners here: each has sides along a row, a column and a diagonal.
+        self._corners = grid.faces.ravel() if grid.is_mesh else None
+        points = 3 * len(grid.faces) if grid.is_mesh else len(grid)
+        pixels = np.tile(TRIANGLE, (len(grid.faces), 1)) if grid.is_mesh else grid.pixels
+        faces = np.arange(points) if grid.is_mesh else grid.faces
+        self._positions = ctx.buffer(reserve=12 * points, dynamic=True)
+        self._values = ctx.buffer(bytes(4 * points), dynamic=True)
+        self._pixels = ctx.buffer(np.ascontiguousarray(pixels, np.float32))
+        self._faces = ctx.buffer(np.ascontiguousarray(faces, np.uint32))
         self._size = grid.size
         self._arrays: dict[str, moderngl.VertexArray] = {}
 
@@ -47,7 +53,7 @@ class SurfacePass:
             camera: Where from, and the picture's size.
         """
         self._resize(camera.width, camera.height)
-        self._positions.write(np.ascontiguousarray(vertices, np.float32))
+        self._positions.write(self._at_corners(vertices))
         self._camera, self._drawn = camera, 0
         self._target.use()
         self._target.clear()
@@ -63,7 +69,7 @@ class SurfacePass:
         """
         array = self._array(name)
         if values is not None:
-            self._values.write(np.ascontiguousarray(values, np.float32))
+            self._values.write(self._at_corners(values))
         set_camera(array.program, self._camera)
         for key, value in (uniforms or {}).items():
             array.program[key] = value
@@ -82,6 +88,10 @@ class SurfacePass:
     def grid_size(self) -> int:
         """Pixels a side of the grid."""
         return self._size
+
+    def _at_corners(self, values: np.ndarray) -> np.ndarray:
+        """What the buffers hold of float32[G, ...]."""
+        return np.ascontiguousarray(values if self._corners is None else values[self._corners], np.float32)
 
     def _array(self, name: str) -> moderngl.VertexArray:
         if name not in self._arrays:

@@ -1,8 +1,9 @@
-"""Small learned corrections of what the tracker measured: head pose, expression, eyes, neck.
+"""What a fit learns about the tracked parameters: corrections of all of them, neck offsets, or nothing.
 
-A correction is a function of the tracked sequence, never of one image alone: a linear map of the tracked
-parameters plus a residual that is smooth in time. Frames without a training image (held out, or in between)
-therefore get the correction of their neighbours; their own image enters only through the tracker.
+A correction (`Corrections`) is a function of the tracked sequence, never of one image alone: a linear map of
+the tracked parameters plus a residual that is smooth in time. Frames without a training image (held out, or
+in between) therefore get the correction of their neighbours; their own image enters only through the tracker.
+The released system's neck offsets (`NeckOffsets`) are a parameter a frame; those without an image have none.
 """
 
 from __future__ import annotations
@@ -31,11 +32,61 @@ class Corrected:
 
     Args:
         pose: Expression, eyes, neck and jaw.
-        rigid: Rotation [3, 3] and translation [3] of the whole head in the head-fixed frame.
+        rigid: Rotation [3, 3] and translation [3] of the whole head in the head-fixed frame; None: none.
     """
 
     pose: Pose
-    rigid: tuple[torch.Tensor, torch.Tensor]
+    rigid: tuple[torch.Tensor, torch.Tensor] | None
+
+
+class Uncorrected(nn.Module):
+    """One capture's parameters as they were tracked."""
+
+    def __init__(self, capture: Capture) -> None:
+        super().__init__()
+        for name in (*POSE_FIELDS, "jaw_rot"):
+            value = torch.from_numpy(getattr(capture, name).copy())
+            self.register_buffer(name, value, persistent=False)
+
+    def at(self, frame: int) -> Corrected:
+        """The parameters of a frame."""
+        p = (self.expr, self.eye_rot, self.neck_rot, self.jaw_rot)
+        return Corrected(Pose(*(x[frame] for x in p)), None)
+
+    def penalty(self, frame: int) -> torch.Tensor:
+        """0."""
+        return self.expr.new_zeros(())
+
+    def corrected(self, clip: Clip) -> Clip:
+        """The clip itself."""
+        return clip
+
+
+class NeckOffsets(Uncorrected):
+    """A small rotation of the neck in every frame, learned with it (fact 32).
+
+    Like the released one it starts at zero and pays its length. Unlike there it adds to the neck that was
+    tracked, instead of replacing it, and is kept: the avatar's clip has it.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        super().__init__(capture)
+        # One parameter a frame: Adam passes by those that got no gradient, as SparseAdam does.
+        self.offsets = nn.ParameterList(torch.zeros(3) for _ in range(len(capture)))
+
+    def at(self, frame: int) -> Corrected:
+        """The parameters of a frame with its neck turned."""
+        pose = super().at(frame).pose
+        return Corrected(replace(pose, neck_rot=pose.neck_rot + self.offsets[frame]), None)
+
+    def penalty(self, frame: int) -> torch.Tensor:
+        """Length of the frame's offset, rad (fact 35)."""
+        return self.offsets[frame].norm()
+
+    def corrected(self, clip: Clip) -> Clip:
+        """The capture's clip with the offsets."""
+        offsets = np.stack([x.detach().cpu().numpy() for x in self.offsets])
+        return replace(clip, neck_rot=(clip.neck_rot + offsets).astype(np.float32))
 
 
 class Corrections(nn.Module):
@@ -77,8 +128,11 @@ class Corrections(nn.Module):
         rotmat = axis_angle_to_rotmat(rot)
         return Corrected(pose, (rotmat, self.pivot - rotmat @ self.pivot + tra))
 
-    def penalty(self) -> torch.Tensor:
-        """Mean squared residual plus mean squared column of the linear map, in units of the expected size."""
+    def penalty(self, frame: int) -> torch.Tensor:
+        """Mean squared residual plus mean squared column of the linear map, in units of the expected size.
+
+        Of all frames, whichever is looked at.
+        """
         return self.residual.square().mean() + self.linear.square().sum(0).mean()
 
     def corrected(self, clip: Clip) -> Clip:
@@ -97,6 +151,17 @@ class Corrections(nn.Module):
                 )
         tracks = zip(POSE_FIELDS, zip(*frames, strict=True), strict=True)
         return replace(clip, **{name: np.stack(values).astype(np.float32) for name, values in tracks})
+
+
+def corrections_named(
+    name: str, capture: Capture, trained: np.ndarray, pivot: np.ndarray, *, video: bool
+) -> Corrections | NeckOffsets | Uncorrected:
+    """What `Preset.corrections` calls by this name; the other arguments are those of `Corrections`."""
+    if name == "auto":
+        name = "none" if len(capture.cameras) > 1 else "tracked"
+    if name == "tracked":
+        return Corrections(capture, trained, pivot, video=video)
+    return NeckOffsets(capture) if name == "neck" else Uncorrected(capture)
 
 
 def _units(n_expr: int) -> torch.Tensor:

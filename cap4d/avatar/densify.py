@@ -90,27 +90,34 @@ def densify(
     *,
     face_sizes: torch.Tensor,
     step: int,
-    room: int,
+    room: int | None,
     per_face: int,
     generator: torch.Generator,
+    worth: torch.Tensor | None = None,
 ) -> None:
     """One round: clone small and split large Gaussians that views pull at, prune faint and huge ones.
 
     Args:
         evidence: Since the last round.
         room: How many more Gaussians there may be after this round; those with the largest gradients are
-            refined.
+            refined. None: any number.
         face_sizes: [M] m (fact 27), which turn local scales into world scales.
         per_face: Triangles keep at least one Gaussian if this is at least 1 (fact 30).
+        worth: [N] what the training views would lose with each (see `removal_errors`). The share
+            `prune_least` that is worth least goes; it makes room for as many.
     """
     n = len(rows.model)
     world = rows.model.gaussians["log_scales"].detach().exp().amax(1) * face_sizes[rows.model.binding]
-    chosen = _most_wanted(evidence.mean_gradient(), settings.gradient, room)
+    needless = _least(worth, settings.prune_least, n)
+    if per_face >= 1:
+        needless &= ~_last_of_their_face(needless, rows.model, len(face_sizes))
+    freed = None if room is None else room + int(needless.sum())
+    chosen = _most_wanted(evidence.mean_gradient(), settings.gradient, freed) & ~needless
     split = chosen & (world > settings.split_scale)
     _clone(rows, chosen & ~split)
-    _split(rows, split, face_sizes, generator)
+    _split(rows, split, face_sizes if settings.split_offset == "world" else None, generator)
     doomed = rows.model.gaussians["opacity_logits"].detach().sigmoid() < settings.prune_opacity
-    doomed[:n] |= split  # their children replace them
+    doomed[:n] |= split | needless  # their children replace those that were split
     if step > settings.prune_big_after:
         doomed[:n] |= (evidence.radius > settings.prune_radius) | (world > settings.prune_scale)
     keep = ~doomed
@@ -125,10 +132,18 @@ def reset_opacity(rows: Rows) -> None:
     rows.overwrite("opacity_logits", rows.model.gaussians["opacity_logits"].detach().clamp(max=ceiling))
 
 
-def _most_wanted(gradient: torch.Tensor, threshold: float, room: int) -> torch.Tensor:
+def _least(worth: torch.Tensor | None, share: float, n: int) -> torch.Tensor:
+    """bool[N]: the share that is worth least; none where nothing is known."""
+    chosen = torch.zeros(n, dtype=torch.bool)
+    if worth is not None and share > 0:
+        chosen[worth.topk(int(share * n), largest=False).indices] = True
+    return chosen
+
+
+def _most_wanted(gradient: torch.Tensor, threshold: float, room: int | None) -> torch.Tensor:
     """bool[N]: above the threshold, and among the `room` largest."""
     wanted = gradient > threshold
-    if int(wanted.sum()) <= room:
+    if room is None or int(wanted.sum()) <= room:
         return wanted
     chosen = torch.zeros_like(wanted)
     if room > 0:
@@ -142,16 +157,20 @@ def _clone(rows: Rows, chosen: torch.Tensor) -> None:
     rows.append(copies, rows.model.binding[chosen])
 
 
-def _split(rows: Rows, chosen: torch.Tensor, face_sizes: torch.Tensor, generator: torch.Generator) -> None:
+def _split(
+    rows: Rows, chosen: torch.Tensor, offset_sizes: torch.Tensor | None, generator: torch.Generator
+) -> None:
     """Replaces large Gaussians by two samples of themselves, 1.6 times smaller.
 
-    The samples are drawn at the Gaussian's local scale. (The released code draws them at its world scale and
-    adds them to local coordinates, fact 30, which leaves the children where the parent was.)
+    The samples are drawn at the Gaussian's local scale, or at `offset_sizes` [M] times that of its face: face
+    sizes make that the world scale, which the released code adds to local coordinates (fact 30).
     """
     # `chosen` speaks of the rows before cloning appended to them.
     index = chosen.nonzero()[:, 0].repeat(CHILDREN)
     children = {name: value.detach()[index].clone() for name, value in rows.model.gaussians.items()}
     noise = torch.randn(len(index), 3, generator=generator) * children["log_scales"].exp()
+    if offset_sizes is not None:
+        noise *= offset_sizes[rows.model.binding[index], None]
     children["means"] += (quat_to_rotmat(children["quats"]) @ noise[:, :, None])[:, :, 0]
     children["log_scales"] -= torch.log(torch.tensor(SPLIT_SHRINK))
     rows.append(children, rows.model.binding[index])

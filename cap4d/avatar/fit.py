@@ -10,28 +10,32 @@ import hashlib
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from cap4d.avatar.checkpoint import load_checkpoint, save_checkpoint
-from cap4d.avatar.corrections import Corrections
+from cap4d.avatar.corrections import corrections_named
+from cap4d.avatar.losses import Distance, Perceptual, gradient_distance
 from cap4d.avatar.model import create_avatar
 from cap4d.avatar.paint import paint
 from cap4d.avatar.presets import Preset, preset_named
+from cap4d.avatar.references import Selection, select, split_selected
 from cap4d.avatar.report import FitReport, compare, summarise, write_sheet
 from cap4d.avatar.trainer import Trainer
 from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, split_views, spread
 from cap4d.camera import opencv_from_rig
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError
-from cap4d.rig.grid import build_grid
+from cap4d.perceptual.lpips import LPIPS_NEEDS, find_lpips, load_lpips
+from cap4d.rig.grid import build_grid, own_triangles
 from cap4d.rig.head import HeadRig
 
 log = logging.getLogger(__name__)
 
-ABLATIONS = (None, "unet")
+ABLATIONS = (None, "unet", "lpips", "remesh", "mmdm")
 PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
 
@@ -45,6 +49,9 @@ def fit(
     resume: bool = False,
     ablate: str | None = None,
     seed: int = 0,
+    lpips_weights: Path | None = None,
+    references: Sequence[tuple[str, int]] | None = None,
+    hold_out: Sequence[str] = (),
 ) -> FitReport:
     """Fits an avatar and writes it, its report and its picture.
 
@@ -55,28 +62,39 @@ def fit(
         output: `.cap4d` file to write.
         preset: Name of a preset, or one.
         resume: Go on from the checkpoint of an interrupted fit, if there is one.
-        ablate: `unet` leaves the deformation network out.
+        ablate: `unet` leaves the deformation network out; `remesh` the UV grid too: the Gaussians ride on the
+            rig's own triangles (`own_triangles`), as in GaussianAvatars; `lpips` the perceptual term; `mmdm`
+            the generated captures, which are all but the first.
         seed: Same seed, same machine: same avatar.
+        lpips_weights: Folder of LPIPS's weights; None looks into the usual places.
+        references: (camera, frame) of the images of the first capture to train on; None: all that are not
+            held out.
+        hold_out: Cameras of the first capture that are never trained on.
     Raises:
         ArgumentError: An unknown preset or ablation, or no frame to train on.
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
     """
     if ablate not in ABLATIONS:
-        raise ArgumentError(f"ablate: expected unet, got {ablate!r}")
+        raise ArgumentError(f"ablate: expected unet, lpips, remesh or mmdm, got {ablate!r}")
+    if ablate == "mmdm":
+        captures = captures[:1]
     if not output.parent.is_dir() or output.is_dir():
         raise ArgumentError(f"output: expected a file in a folder that exists, got {output}")
     settings = preset_named(preset) if isinstance(preset, str) else preset
-    if settings.weights.lpips > 0:
-        raise ArgumentError("lpips: expected 0, this build has no LPIPS term")
+    if ablate == "lpips":
+        settings = replace(settings, perceptual=Perceptual())
+    perceptual = distance_of(settings.perceptual, lpips_weights)
     started = time.monotonic()
     loaded = [Capture.load(path) for path in captures]
     for capture in loaded:
         check_rig(capture, rig)
-    split = split_views(loaded, load_views(loaded, settings.image_size))
-    trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed)
+    selection = select(loaded[0], references, hold_out)
+    split = split_captures(loaded, selection, settings.image_size)
+    trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed, perceptual=perceptual)
     checkpoint = output.with_suffix(".fit.ckpt")
-    data = fingerprint(captures, settings)
-    kind = f"preset {settings.name}, rig {rig.name}, ablate {ablate}, seed {seed}, data {data}"
+    data = fingerprint(captures, settings, selection)
+    left_out = "" if perceptual or settings.perceptual.kind == "none" else ", without LPIPS"
+    kind = f"preset {settings.name}{left_out}, rig {rig.name}, ablate {ablate}, seed {seed}, data {data}"
     spent = 0.0
     if resume and checkpoint.exists():
         state = load_checkpoint(checkpoint, kind=kind)
@@ -105,33 +123,60 @@ def prepare(
     *,
     ablate: str | None,
     seed: int,
+    perceptual: Distance | None = None,
 ) -> Trainer:
     """A trainer at step 0."""
     generator = torch.Generator().manual_seed(seed)
     model = create_avatar(
         rig,
         captures[0].shape,
-        grid=build_grid(rig, preset.grid_size),
+        grid=own_triangles(rig) if ablate == "remesh" else build_grid(rig, preset.grid_size),
         gaussians=preset.gaussians,
         per_face=preset.per_face,
         sh_degree=preset.sh_degree,
-        deformer_width=None if ablate == "unet" else preset.deformer_width,
+        deformer_width=None if ablate in ("unet", "remesh") else preset.deformer_width,
         generator=generator,
     )
     pivot = opencv_from_rig(model.subject.neutral.mean(0)).numpy()
     corrections = [
-        Corrections(c, _trained(i, c, split.train), pivot, video=is_video(c)) for i, c in enumerate(captures)
+        corrections_named(preset.corrections, c, _trained(i, c, split.train), pivot, video=is_video(c))
+        for i, c in enumerate(captures)
     ]
     if preset.paint:
         some = spread(split.train, PAINT_VIEWS)
         with torch.no_grad():
             paint(model, some, [corrections[v.capture].at(v.frame).pose for v in some])
-    return Trainer(model, corrections, split.train, preset, seed=seed)
+    return Trainer(model, corrections, split.train, preset, seed=seed, perceptual=perceptual)
 
 
-def fingerprint(captures: Sequence[Path], settings: Preset) -> str:
-    """Twelve hex digits that change with the settings and with what was tracked: whose checkpoint it is."""
-    digest = hashlib.sha256(repr(settings).encode())
+def distance_of(perceptual: Perceptual, weights: Path | None) -> Distance | None:
+    """What a perceptual term compares [0, 1] images by; None without one, or without the weights it needs.
+
+    Raises:
+        ArgumentError, DataError: The folder lacks weights, or they are not LPIPS's.
+    """
+    if perceptual.kind != "lpips":
+        return gradient_distance if perceptual.kind == "gradient" else None
+    files = find_lpips(weights)
+    if files is None:
+        log.warning("the fit goes on without its LPIPS term: %s", LPIPS_NEEDS)
+        return None
+    network = load_lpips(files)
+    if perceptual.image_range == "compat":
+        return network
+    return lambda image, target: network(2 * image - 1, 2 * target - 1)
+
+
+def split_captures(captures: Sequence[Capture], selection: Selection | None, image_size: int) -> Split:
+    """The views to train on and those to be judged by."""
+    if selection is None:
+        return split_views(captures, load_views(captures, image_size))
+    return split_selected(captures, selection, image_size)
+
+
+def fingerprint(captures: Sequence[Path], settings: Preset, selection: Selection | None = None) -> str:
+    """Twelve hex digits that change with settings, selection and what was tracked: whose checkpoint it is."""
+    digest = hashlib.sha256(repr(settings if selection is None else (settings, selection)).encode())
     for path in captures:
         digest.update((path / "fit.npz").read_bytes())
     return digest.hexdigest()[:12]

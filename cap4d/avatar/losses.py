@@ -1,16 +1,19 @@
-"""What a fitted avatar pays for: unlike pixels, stray Gaussians, rough or needless deformation (facts 33-35).
+"""What a fitted avatar pays for: unlike pixels, stray Gaussians, rough or needless deformation.
 
-The photometric part has a named place for LPIPS, which needs weights that no package ships.
+Facts 33-35.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 
 from cap4d.avatar.deformer import DEFORM_STD
+from cap4d.avatar.similarity import l1_and_ssim
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004, sec. III-B
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # their K1, K2 at a dynamic range of 1
@@ -25,19 +28,17 @@ class LossWeights:
         l1, dssim: Photometric mixture, 0.6 L1 + 0.4 (1 - SSIM).
         matte: L1 of the rendered coverage against the matte; without it white Gaussians may stand in for
             background.
-        lpips: Greatest share that LPIPS takes from the mixture; 0 leaves it out.
         position, position_limit: Local means beyond the limit (face sizes).
         scale, scale_limit: Local scales beyond the limit (face sizes).
         laplacian: Roughness of the deformation map.
         deformation: Size of its expression-dependent part.
         rotation: Turning of the triangles by that part.
-        pose: Learned corrections of head pose, expression, eyes and neck.
+        pose: Learned corrections of head pose, expression, eyes and neck, or neck offsets.
     """
 
     l1: float = 0.6
     dssim: float = 0.4
     matte: float = 0.1
-    lpips: float = 0.0
     position: float = 1e-3
     position_limit: float = 2.0
     scale: float = 1.0
@@ -48,9 +49,63 @@ class LossWeights:
     pose: float = 1.0
 
 
+@dataclass(frozen=True)
+class Perceptual:
+    """A second opinion on the pixels, whose share of the photometric loss rises linearly (fact 33).
+
+    Args:
+        kind: `lpips` (cap4d.perceptual), `gradient` (`gradient_distance`), or `none`.
+        weight: Factor of the distance, beside its share.
+        most: Share that it has at last; the mixture of L1 and SSIM has the rest.
+        start, stop: Steps from and to which the share rises.
+        image_range: `fixed`: LPIPS sees images in [-1, 1]; `compat`: in [0, 1], as the released code has it.
+    """
+
+    kind: Literal["none", "lpips", "gradient"] = "none"
+    weight: float = 0.0
+    most: float = 0.0
+    start: int = 0
+    stop: int = 0
+    image_range: Literal["fixed", "compat"] = "fixed"
+
+    @staticmethod
+    def of(kind: str, start: int, stop: int) -> Perceptual:
+        """The usual weights of each kind."""
+        weight, most = {"none": (0.0, 0.0), "lpips": (0.1, 0.9), "gradient": (1.0, 0.5)}[kind]
+        return Perceptual(kind, weight, most, start, stop)
+
+    def share(self, step: int) -> float:
+        """In [0, most]."""
+        if step <= self.start or self.kind == "none":
+            return 0.0
+        return self.most * min(1.0, (step - self.start) / max(1, self.stop - self.start))
+
+
+Distance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+"""What compares a rendered with a real [H, W, 3] image in [0, 1]."""
+
+
+def gradient_distance(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Mean L1 distance of the horizontal and vertical differences of two images, summed over three scales.
+
+    A stand-in for LPIPS that needs no weights: like it, it minds blurred or missing edges more than a change
+    of tone. It knows nothing of what people see. (Gradient difference loss of Mathieu et al. 2016, eq. 6,
+    with signs, on full, half and quarter size.)
+    """
+    x, total = (image - target).permute(2, 0, 1)[None], image.new_zeros(())
+    for scale in range(3):
+        x = F.avg_pool2d(x, 2) if scale else x
+        total = total + x.diff(dim=-1).abs().mean() + x.diff(dim=-2).abs().mean()
+    return total
+
+
 def photometric(image: torch.Tensor, target: torch.Tensor, weights: LossWeights) -> torch.Tensor:
-    """0.6 L1 + 0.4 (1 - SSIM) of two [H, W, 3] images in [0, 1] (fact 33 before its LPIPS ramp)."""
-    return weights.l1 * (image - target).abs().mean() + weights.dssim * (1 - ssim_map(image, target).mean())
+    """0.6 L1 + 0.4 (1 - SSIM) of two [H, W, 3] images in [0, 1] (fact 33 without its LPIPS)."""
+    if image.device.type == "cpu" and image.dtype == target.dtype == torch.float32:
+        absolute, similar = l1_and_ssim(image, target)
+    else:
+        absolute, similar = (image - target).abs().mean(), ssim_map(image, target).mean()
+    return weights.l1 * absolute + weights.dssim * (1 - similar)
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -172,10 +172,27 @@ class AvatarModel(nn.Module):
 
 
 def initial_counts(rig: HeadRig, grid: UvGrid, *, gaussians: int, per_face: int) -> np.ndarray:
-    """int64[M] Gaussians per triangle: by area on the template, at least `per_face` (fact 29)."""
+    """int64[M] Gaussians per triangle: by area on the template, at least `per_face` (fact 29).
+
+    On the rig's own triangles those few that each has anyway are part of the budget: a rig may have more of
+    them than a UV grid, and would otherwise begin with more Gaussians.
+    """
     corners = remesh(rig, grid).template.astype(np.float64)[grid.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.maximum(per_face, np.round(gaussians * areas / areas.sum())).astype(np.int64)
+    shares = areas / areas.sum()
+    counts = _counts(shares, gaussians, per_face)
+    if not grid.is_mesh or counts.sum() <= gaussians:
+        return counts
+    low, high = 0.0, float(gaussians)
+    while high - low > 1:
+        middle = (low + high) / 2
+        within = _counts(shares, middle, per_face).sum() <= gaussians
+        low, high = (middle, high) if within else (low, middle)
+    return _counts(shares, low, per_face)
+
+
+def _counts(shares: np.ndarray, gaussians: float, per_face: int) -> np.ndarray:
+    return np.maximum(per_face, np.round(gaussians * shares)).astype(np.int64)
 
 
 def initial_gaussians(

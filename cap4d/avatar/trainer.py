@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from cap4d.avatar.corrections import Corrections
 from cap4d.avatar.densify import Evidence, Rows, densify, reset_opacity
 from cap4d.avatar.losses import (
+    Distance,
     laplacian_loss,
     photometric,
     position_loss,
@@ -26,17 +26,15 @@ from cap4d.avatar.losses import (
 )
 from cap4d.avatar.model import AvatarModel, Posed
 from cap4d.avatar.presets import Preset
-from cap4d.avatar.views import FitView
+from cap4d.avatar.views import FitView, spread
+from cap4d.avatar.worth import removal_errors
 from cap4d.bind import triangle_frames
 from cap4d.camera import opencv_from_rig
 from cap4d.raster import Rasterized, rasterize
 
-ROTATION_EVERY = 4  # steps: the term is slow and smooth, so it comes in now and then with as much more weight
 WHITE = (1.0, 1.0, 1.0)
 ADAM_EPS = 1e-15  # fact 36; gradients of a mean over pixels are tiny
-GAUSSIAN_EPS = (
-    1e-8  # visible Gaussians' gradients are 100 times larger; hidden ones must not dance to their noise
-)
+WORTH_VIEWS = 12  # that are asked which Gaussians they would miss
 
 
 class Trainer:
@@ -44,23 +42,25 @@ class Trainer:
 
     Args:
         model: What is fitted.
-        corrections: One per capture.
+        corrections: One per capture: `Corrections`, `NeckOffsets` or `Uncorrected`.
         views: Training views.
         preset: Schedule, rates and weights.
         seed: Of the order of views and of densification.
+        perceptual: What `preset.perceptual` compares images by; None leaves the term out.
     """
 
     def __init__(
         self,
         model: AvatarModel,
-        corrections: Sequence[Corrections],
+        corrections: Sequence[nn.Module],
         views: Sequence[FitView],
         preset: Preset,
         *,
         seed: int,
+        perceptual: Distance | None = None,
     ) -> None:
         self.model, self.preset, self.views, self.seed = model, preset, views, seed
-        self.corrections = nn.ModuleList(corrections)
+        self.corrections, self.perceptual = nn.ModuleList(corrections), perceptual
         self.step = 0
         self.evidence = Evidence(len(model))
         self.optimizer = _optimizer(model, self.corrections, preset)
@@ -89,13 +89,7 @@ class Trainer:
         Args:
             noise: Standard deviation of what is added to the expression that the network sees, rig units.
         """
-        corrected = self.corrections[view.capture].at(view.frame)
-        pose = seen = corrected.pose
-        if noise > 0:
-            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
-            jitter = noise * torch.randn(pose.expr.shape, generator=generator)
-            seen = replace(pose, expr=pose.expr.detach() + jitter)
-        posed = self.model.pose(pose, rigid=corrected.rigid, network_pose=seen)
+        posed = self._posed(view, noise=noise)
         rendered = rasterize(
             posed.means,
             posed.quats,
@@ -108,6 +102,15 @@ class Trainer:
         )
         return posed, rendered
 
+    def _posed(self, view: FitView, *, noise: float = 0.0) -> Posed:
+        corrected = self.corrections[view.capture].at(view.frame)
+        pose = seen = corrected.pose
+        if noise > 0:
+            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
+            jitter = noise * torch.randn(pose.expr.shape, generator=generator)
+            seen = replace(pose, expr=pose.expr.detach() + jitter)
+        return self.model.pose(pose, rigid=corrected.rigid, network_pose=seen)
+
     @property
     def sh_degree(self) -> int:
         """Harmonics come in one degree at a time (fact 37)."""
@@ -116,21 +119,30 @@ class Trainer:
     def _loss(self, view: FitView, posed: Posed, rendered: Rasterized) -> torch.Tensor:
         w, local = self.preset.weights, self.model.gaussians
         visible = rendered.radii > 0
-        loss = photometric(rendered.rgb, view.target, w)
+        loss = self._photometric(rendered.rgb, view.target)
         if view.coverage is not None and w.matte > 0:
             loss = loss + w.matte * (rendered.alpha - view.coverage.float()).abs().mean()
         loss = loss + w.position * position_loss(local["means"], visible, w.position_limit)
         loss = loss + w.scale * scale_loss(local["log_scales"], visible, w.scale_limit)
-        loss = loss + w.pose * self.corrections[view.capture].penalty()
+        loss = loss + w.pose * self.corrections[view.capture].penalty(view.frame)
         d = posed.deformation
         if d is None:
             return loss
         loss = loss + w.laplacian * laplacian_loss(d.maps)
         loss = loss + w.deformation * relative_deformation_loss(d.moved, d.neutral)
-        if self.step % ROTATION_EVERY:
+        every = self.preset.rotation_every
+        if self.step % every:
             return loss
         turning = rotation_term(posed.surface, d.moved, d.neutral, self.faces)
-        return loss + ROTATION_EVERY * w.rotation * turning
+        return loss + every * w.rotation * turning
+
+    def _photometric(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """The mixture of L1 and SSIM, less and less of it as the perceptual distance comes in (fact 33)."""
+        loss, p = photometric(image, target, self.preset.weights), self.preset.perceptual
+        share = p.share(self.step)
+        if self.perceptual is None or share == 0:
+            return loss
+        return share * p.weight * self.perceptual(image, target) + (1 - share) * loss
 
     def _refine(self) -> None:
         d = self.preset.densify
@@ -145,14 +157,21 @@ class Trainer:
                 room=self._room(),
                 per_face=self.preset.per_face,
                 generator=generator,
+                worth=self._worth(generator) if d.prune_least > 0 else None,
             )
             self.evidence = Evidence(len(self.model))
-        if d.reset_every and self.step % d.reset_every == 0 and self.step <= d.stop:
+        if d.resets_at(self.step):
             reset_opacity(self.rows)
 
-    def _room(self) -> int:
+    def _worth(self, generator: torch.Generator) -> torch.Tensor:
+        views = spread(self.views, WORTH_VIEWS)
+        return removal_errors(self._posed, views, sh_degree=self.sh_degree, generator=generator)
+
+    def _room(self) -> int | None:
         """An even share of the growth that is left: early rounds know least about where detail is missing."""
         d = self.preset.densify
+        if d.most is None:
+            return None
         rounds = (d.stop - self.step) // d.every + 1
         return math.ceil((d.most - len(self.model)) / rounds)
 
@@ -220,11 +239,12 @@ def _optimizer(model: AvatarModel, corrections: nn.ModuleList, preset: Preset) -
         "quats": r.rotation,
     }
     groups: list[dict[str, Any]] = [
-        {"params": [model.gaussians[n]], "ends": e, "eps": GAUSSIAN_EPS}
+        {"params": [model.gaussians[n]], "ends": e, "eps": r.gaussian_eps}
         for n, e in ends.items()
         if model.gaussians[n].numel()
     ]
-    groups.append({"params": list(corrections.parameters()), "ends": r.correction})
+    if corrected := list(corrections.parameters()):
+        groups.append({"params": corrected, "ends": r.correction, "eps": r.correction_eps})
     if model.deformer is not None:
         decay = r.deformer_decay
         groups.append(

@@ -20,7 +20,7 @@ class Bundle:
     Args:
         rig_licence: SPDX-like tag of what the rig was made from.
         expression_range: float32[E, 2] useful values.
-        grid: The rig's UV grid.
+        grid: The rig's UV grid, or its own triangles, which have no deformer.
         subject: The head on the G grid vertices, rig axes; float32.
         deform_neutral: float32[G, 3] m, head frame, OpenCV axes: the network's answer to no offsets.
         deform_onnx: Network `offsets` float32[1, 3, S, S] m -> `deformation`, the same, with scaling, masks

@@ -24,13 +24,14 @@ def describe(path: str | Path) -> str:
 def _lines(path: Path, manifest: Manifest, bundle: Bundle) -> list[str]:
     counts, camera = manifest.counts, manifest.camera
     size, degree = counts["grid_size"], SH_COUNTS[counts["sh_coefficients"]]
+    surface = f"grid: {size}x{size}" if size else "grid: none, the rig's own triangles"
     seconds = counts["idle_frames"] / manifest.idle_fps
     lines = [
         f"{path}: {path.stat().st_size / 1e6:.1f} MB, version {manifest.version}, {manifest.precision}, "
         "every hash and value checked",
         f"rig: {manifest.rig_name} ({manifest.rig_licence}), {counts['expressions']} expressions, "
         f"{counts['joints']} joints ({', '.join(manifest.joint_drivers) or 'none'})",
-        f"grid: {size}x{size}, {counts['grid_vertices']} vertices, {counts['faces']} faces",
+        f"{surface}, {counts['grid_vertices']} vertices, {counts['faces']} faces",
         f"gaussians: {counts['gaussians']}, spherical harmonics of degree {degree}",
         f"camera: {camera.width}x{camera.height}, focal length {camera.K[0, 0]:.1f} px",
         f"idle clip: {counts['idle_frames']} frames, {seconds:.1f} s at {manifest.idle_fps:g} fps",

@@ -19,6 +19,8 @@ from cap4d.bundle.schema import (
     MANIFEST,
     MAX_ENTRY_BYTES,
     MAX_GRID_VALUES,
+    MIN_GRID_SIZE,
+    ONNX,
     OPTIONAL_ENTRIES,
     PRECISIONS,
     REQUIRED_ENTRIES,
@@ -144,6 +146,7 @@ class Manifest:
             group.finish()
         _check_points(where, manifest)
         _check_version(where, manifest)
+        _check_deformers(where, manifest)
         return manifest
 
 
@@ -153,14 +156,30 @@ def digest(data: bytes) -> str:
 
 
 def _check_version(where: str, manifest: Manifest) -> None:
-    """What version 2 brought makes a file unreadable to a reader of version 1, so such a file must say 2."""
+    """What a version brought makes a file unreadable to older readers, so such a file must say so."""
     brought = {
-        "precision mixed": manifest.precision == "mixed",
-        "deformer": bool(manifest.tier_errors),
-        INT8: INT8 in manifest.entries,
+        "precision mixed": (2, manifest.precision == "mixed"),
+        "deformer": (2, bool(manifest.tier_errors)),
+        INT8: (2, INT8 in manifest.entries),
+        "grid_size 0": (3, manifest.counts["grid_size"] == 0),
     }
-    for name in (name for name, used in brought.items() if used and manifest.version < 2):
-        raise DataError(where, "version", expected=f"2 or more, for {name}", found=manifest.version)
+    for name, (version, used) in brought.items():
+        if used and manifest.version < version:
+            expected = f"{version} or more, for {name}"
+            raise DataError(where, "version", expected=expected, found=manifest.version)
+
+
+def _check_deformers(where: str, manifest: Manifest) -> None:
+    """A network sees the pixels of a grid. The rig's own triangles lie on none."""
+    if manifest.counts["grid_size"] > 0:
+        return
+    for name in (ONNX, INT8):
+        if name in manifest.entries:
+            expected = "no network where grid_size is 0"
+            raise DataError(where, f"entries.{name}", expected=expected, found="one")
+    if manifest.tier_errors:
+        expected, found = "no deformers where grid_size is 0", ", ".join(manifest.tier_errors)
+        raise DataError(where, "deformer", expected=expected, found=found)
 
 
 def _tier_errors(fields: _Fields) -> dict[str, tuple[float, float]]:
@@ -179,9 +198,20 @@ def _check_points(where: str, manifest: Manifest) -> None:
     points, wanted = manifest.counts["rig_points"], manifest.counts[kind]
     if points != wanted:
         raise DataError(where, "counts.rig_points", expected=f"{wanted}, the number of {kind}", found=points)
-    if manifest.rig_points == "mesh" and points >= manifest.counts["grid_vertices"]:
+    if manifest.counts["grid_size"] == 0:
+        _check_own_triangles(where, manifest)
+    elif manifest.rig_points == "mesh" and points >= manifest.counts["grid_vertices"]:
         expected = f"fewer than the grid's {manifest.counts['grid_vertices']}, or points on the grid"
         raise DataError(where, "counts.rig_points", expected=expected, found=points)
+
+
+def _check_own_triangles(where: str, manifest: Manifest) -> None:
+    if manifest.rig_points != "mesh":
+        raise DataError(where, "rig.points", expected="mesh where grid_size is 0", found=manifest.rig_points)
+    points, vertices = manifest.counts["rig_points"], manifest.counts["grid_vertices"]
+    if vertices != points:
+        expected = f"{points}, the rig's vertices, where grid_size is 0"
+        raise DataError(where, "counts.grid_vertices", expected=expected, found=vertices)
 
 
 def _counts(fields: _Fields) -> dict[str, int]:
@@ -190,8 +220,12 @@ def _counts(fields: _Fields) -> dict[str, int]:
     if counts["sh_coefficients"] not in SH_COUNTS:
         found = counts["sh_coefficients"]
         raise DataError(fields.where, "counts.sh_coefficients", expected="1, 4, 9 or 16", found=found)
-    if counts["grid_vertices"] > counts["grid_size"] ** 2:
-        expected = f"at most {counts['grid_size'] ** 2}, the pixels of the grid"
+    size = counts["grid_size"]
+    if 0 < size < MIN_GRID_SIZE:
+        expected = f"at least {MIN_GRID_SIZE}, or 0 for the rig's own triangles"
+        raise DataError(fields.where, "counts.grid_size", expected=expected, found=size)
+    if size > 0 and counts["grid_vertices"] > size**2:
+        expected = f"at most {size**2}, the pixels of the grid"
         raise DataError(
             fields.where, "counts.grid_vertices", expected=expected, found=counts["grid_vertices"]
         )

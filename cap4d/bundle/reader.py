@@ -34,7 +34,7 @@ from cap4d.bundle.schema import (
 )
 from cap4d.drive.clip import Clip
 from cap4d.errors import DataError
-from cap4d.rig.grid import UvGrid
+from cap4d.rig.grid import UvGrid, mesh_grid
 from cap4d.rig.head import Subject
 
 DTYPES = {
@@ -140,16 +140,8 @@ def _assemble(
     networks: tuple[bytes | None, dict[str, np.ndarray] | None],
     preview: bytes,
 ) -> Bundle:
-    grid_tensors = tensors[GRID]
-    linear = grid_tensors.get("deform_linear")
-    grid = UvGrid(
-        size=manifest.counts["grid_size"],
-        pixels=grid_tensors["pixels"].astype(np.int16),
-        faces=grid_tensors["faces"].astype(np.int32),
-        deformable=grid_tensors["deformable"].astype(bool),
-        vertices=grid_tensors["vertices"].astype(np.int32),
-        bary=grid_tensors["bary"].astype(np.float32),
-    )
+    grid, neutral = _grid(manifest, tensors[GRID])
+    linear = tensors[GRID].get("deform_linear")
     names = {"rig_name": manifest.rig_name, "expression_names": manifest.expression_names}
     subject = Subject(**names, joint_drivers=manifest.joint_drivers, **_floats(tensors[RIG]))
     mesh = subject if manifest.rig_points == "mesh" else None
@@ -158,8 +150,8 @@ def _assemble(
         rig_licence=manifest.rig_licence,
         expression_range=manifest.expression_range,
         grid=grid,
-        subject=subject if mesh is None else mesh.resample(grid.vertices, grid.bary),
-        deform_neutral=grid_tensors["deform_neutral"].astype(np.float32),
+        subject=subject if mesh is None or grid.is_mesh else mesh.resample(grid.vertices, grid.bary),
+        deform_neutral=neutral,
         deform_onnx=networks[0],
         **_floats(gaussians),
         binding=tensors[GAUSSIANS]["binding"].astype(np.int32),
@@ -172,6 +164,23 @@ def _assemble(
         tier_errors=manifest.tier_errors,
         rig_vertices=manifest.counts["rig_vertices"],
     )
+
+
+def _grid(manifest: Manifest, tensors: dict[str, np.ndarray]) -> tuple[UvGrid, np.ndarray]:
+    """The surface, and float32[G, 3] m the network's answer to no offsets."""
+    size, faces = manifest.counts["grid_size"], tensors["faces"].astype(np.int32)
+    if size == 0:
+        points = manifest.counts["grid_vertices"]
+        return mesh_grid(faces, points), np.zeros((points, 3), np.float32)
+    grid = UvGrid(
+        size=size,
+        pixels=tensors["pixels"].astype(np.int16),
+        faces=faces,
+        deformable=tensors["deformable"].astype(bool),
+        vertices=tensors["vertices"].astype(np.int32),
+        bary=tensors["bary"].astype(np.float32),
+    )
+    return grid, tensors["deform_neutral"].astype(np.float32)
 
 
 def _floats(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cap4d.errors import DataError
 
-FORMAT, VERSION = "cap4d", 2
+FORMAT, VERSION = "cap4d", 3
 PRECISIONS = ("float32", "float16", "mixed")
 """`mixed`: every packed tensor is float32, float16 or int8, as its own dtype says."""
 TIERS = ("full", "fp16", "int8", "linear", "off")
@@ -30,7 +30,7 @@ MAX_ENTRY_BYTES = {
 }
 
 COUNTS = {
-    "grid_size": (8, 1024),
+    "grid_size": (0, 1024),  # 0: no grid, the rig's own triangles; otherwise at least MIN_GRID_SIZE
     "grid_vertices": (3, 1 << 20),
     "faces": (1, 1 << 21),
     "gaussians": (1, 1 << 22),
@@ -42,6 +42,7 @@ COUNTS = {
     "idle_frames": (1, 100_000),
 }
 """Inclusive limits of every count in the manifest."""
+MIN_GRID_SIZE = 8
 MAX_GRID_VALUES = MAX_ENTRY_BYTES[RIG] // 4
 """Of a basis on the grid's vertices, [E, G, 3] or [9J, G, 3]: no more than its entry holds in float32."""
 
@@ -75,6 +76,7 @@ class TensorSpec:
         steps: Whether each `row` (first index) or each `column` (the other indices) has its own step where
             the tensor is int8. Those of rows may be masked.
         since: The first version of the format that has it.
+        of_grid: Only a UV grid has it: not there where `grid_size` is 0.
     """
 
     shape: tuple[int | str, ...]
@@ -85,6 +87,7 @@ class TensorSpec:
     optional: bool = False
     steps: Steps = "column"
     since: int = 1
+    of_grid: bool = False
 
 
 METRES = {"low": -10.0, "high": 10.0}  # a head is 0.3 m: catches millimetres and rubbish alike
@@ -92,13 +95,15 @@ RADIANS = {"low": -100.0, "high": 100.0}
 
 TENSORS: dict[str, dict[str, TensorSpec]] = {
     GRID: {
-        "pixels": TensorSpec(("G", 2), "index", below="S"),
+        "pixels": TensorSpec(("G", 2), "index", below="S", of_grid=True),
         "faces": TensorSpec(("M", 3), "index", below="G"),
-        "deformable": TensorSpec(("G",), "flag"),
-        "vertices": TensorSpec(("G", 3), "index", below="V"),
-        "bary": TensorSpec(("G", 3), low=-0.01, high=1.01),
-        "deform_neutral": TensorSpec(("G", 3), **METRES),
-        "deform_linear": TensorSpec(("E", "G", 3), "packed", **METRES, optional=True, steps="row", since=2),
+        "deformable": TensorSpec(("G",), "flag", of_grid=True),
+        "vertices": TensorSpec(("G", 3), "index", below="V", of_grid=True),
+        "bary": TensorSpec(("G", 3), low=-0.01, high=1.01, of_grid=True),
+        "deform_neutral": TensorSpec(("G", 3), **METRES, of_grid=True),
+        "deform_linear": TensorSpec(
+            ("E", "G", 3), "packed", **METRES, optional=True, steps="row", since=2, of_grid=True
+        ),
     },
     RIG: {
         "neutral": TensorSpec(("P", 3), **METRES),
@@ -169,7 +174,12 @@ def check_tensors(
         DataError: Naming `source:entry`, the tensor, what was expected and what was found.
     """
     where = f"{source}:{entry}"
-    specs = {name: spec for name, spec in TENSORS[entry].items() if spec.since <= version}
+    has_grid = counts["grid_size"] > 0
+    specs = {
+        name: spec
+        for name, spec in TENSORS[entry].items()
+        if spec.since <= version and (has_grid or not spec.of_grid)
+    }
     for name in tensors:
         if name not in specs:
             raise DataError(where, "tensors", expected=f"only {', '.join(specs)}", found=repr(name[:64]))
@@ -209,18 +219,14 @@ def check_relations(source: str, tensors: Mapping[str, Mapping[str, np.ndarray]]
         DataError: As above.
     """
     grid, rig, gaussians, idle = (tensors[entry] for entry in (GRID, RIG, GAUSSIANS, IDLE))
-    pixels = grid["pixels"].astype(np.int64)
-    scan = pixels[:, 0] * (1 << 16) + pixels[:, 1]
-    at = int(np.argmin(np.diff(scan))) if len(scan) > 1 else 0
-    if len(scan) > 1 and scan[at + 1] <= scan[at]:
-        found = f"{pixels[at + 1].tolist()} after {pixels[at].tolist()}"
-        raise DataError(f"{source}:{GRID}", "pixels", expected="each pixel once, in scan order", found=found)
+    if "pixels" in grid:
+        _check_scan_order(f"{source}:{GRID}", grid["pixels"].astype(np.int64))
+        _check_sums(f"{source}:{GRID}", "bary", grid["bary"], 1 - 1e-3, 1 + 1e-3)
     faces = grid["faces"]
     repeated = (faces == np.roll(faces, 1, axis=1)).any(1)
     if repeated.any():
         found = faces[np.argmax(repeated)].tolist()
         raise DataError(f"{source}:{GRID}", "faces", expected="three different vertices", found=found)
-    _check_sums(f"{source}:{GRID}", "bary", grid["bary"], 1 - 1e-3, 1 + 1e-3)
     if "deform_linear" in grid and grid["deform_linear"][:, grid["deformable"] == 0].any():
         expected, found = "0 where the grid is not deformable", "another number"
         raise DataError(f"{source}:{GRID}", "deform_linear", expected=expected, found=found)
@@ -232,6 +238,14 @@ def check_relations(source: str, tensors: Mapping[str, Mapping[str, np.ndarray]]
         raise DataError(f"{source}:{GAUSSIANS}", "quats", expected="norms of at least 1e-6", found=found)
     if ("rot" in idle) != ("tra" in idle):
         raise DataError(f"{source}:{IDLE}", "rot, tra", expected="both or neither", found="one of them")
+
+
+def _check_scan_order(where: str, pixels: np.ndarray) -> None:
+    scan = pixels[:, 0] * (1 << 16) + pixels[:, 1]
+    at = int(np.argmin(np.diff(scan))) if len(scan) > 1 else 0
+    if len(scan) > 1 and scan[at + 1] <= scan[at]:
+        found = f"{pixels[at + 1].tolist()} after {pixels[at].tolist()}"
+        raise DataError(where, "pixels", expected="each pixel once, in scan order", found=found)
 
 
 def _check_sums(where: str, name: str, values: np.ndarray, low: float, high: float) -> None:

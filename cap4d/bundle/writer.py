@@ -52,7 +52,8 @@ def write_bundle(bundle: Bundle, path: str | Path, *, precision: Precision = "fl
             float32 or float16 for `deform.onnx`; what is not named is float32.
     Raises:
         DataError: The bundle breaks a rule of FORMAT.md: whatever is written can be read.
-        ArgumentError: The folder is not there, or `subject` is not the mixture of `mesh_subject`.
+        ArgumentError: The folder is not there, `subject` is not the mixture of `mesh_subject`, or there is a
+            deformation on the rig's own triangles.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -70,7 +71,9 @@ def bundle_entries(
     """
     forms = _forms(precision)
     name = precision if isinstance(precision, str) else "mixed"
-    version = 2 if name == "mixed" or _is_of_version_2(bundle) else 1
+    version = _version(bundle, name)
+    if bundle.grid.is_mesh:
+        _check_own_triangles(bundle)
     entries = _tensor_entries(bundle, source, forms, precision=name, version=version)
     entries[PREVIEW] = bundle.preview
     check_png(bundle.preview, source=f"{source}:{PREVIEW}")
@@ -97,8 +100,12 @@ def _forms(precision: Precision) -> dict[str, Form]:
     return dict.fromkeys((*PACKED, ONNX), "float32") | dict(precision)
 
 
-def _is_of_version_2(bundle: Bundle) -> bool:
-    return bundle.deform_int8 is not None or bundle.deform_linear is not None or bool(bundle.tier_errors)
+def _version(bundle: Bundle, precision: str) -> int:
+    """The lowest that knows all that the bundle has."""
+    if bundle.grid.is_mesh:
+        return 3
+    tiers = bundle.deform_int8 is not None or bundle.deform_linear is not None or bool(bundle.tier_errors)
+    return 2 if precision == "mixed" or tiers else 1
 
 
 def _tensor_entries(
@@ -127,7 +134,7 @@ def bundle_counts(bundle: Bundle) -> dict[str, int]:
     """The manifest's counts."""
     return {
         "grid_size": bundle.grid.size,
-        "grid_vertices": len(bundle.grid.pixels),
+        "grid_vertices": len(bundle.grid),
         "faces": len(bundle.grid.faces),
         "gaussians": len(bundle.means),
         "sh_coefficients": bundle.sh.shape[1],
@@ -140,7 +147,10 @@ def bundle_counts(bundle: Bundle) -> dict[str, int]:
 
 
 def stored_subject(bundle: Bundle) -> Subject:
-    """The subject that goes into the file: on the rig's vertices where those are fewer than the grid's."""
+    """The subject that goes into the file: on the rig's vertices where those are fewer than the grid's.
+
+    Of the rig's own triangles, `subject` stands on the rig's vertices itself.
+    """
     mesh = bundle.mesh_subject
     return mesh if mesh is not None and len(mesh.neutral) < len(bundle.subject.neutral) else bundle.subject
 
@@ -162,7 +172,7 @@ def _manifest(bundle: Bundle, entries: dict[str, bytes], *, precision: str, vers
         precision=precision,
         rig_name=bundle.rig_name,
         rig_licence=bundle.rig_licence,
-        rig_points="mesh" if on_mesh else "grid",
+        rig_points="mesh" if on_mesh or bundle.grid.is_mesh else "grid",
         joint_drivers=bundle.subject.joint_drivers,
         expression_names=bundle.subject.expression_names,
         expression_range=bundle.expression_range,
@@ -182,8 +192,19 @@ def _check_mixture(bundle: Bundle) -> None:
             raise ArgumentError(f"subject.{name}: expected the mixture of mesh_subject's, got another")
 
 
+def _check_own_triangles(bundle: Bundle) -> None:
+    for name in ("deform_onnx", "deform_int8", "deform_linear"):
+        if getattr(bundle, name) is not None:
+            raise ArgumentError(f"{name}: expected none on the rig's own triangles, got one")
+    for name, found in (("deform_neutral", bundle.deform_neutral.any()), ("tier_errors", bundle.tier_errors)):
+        if found:
+            raise ArgumentError(f"{name}: expected nothing on the rig's own triangles, got something")
+
+
 def _grid_tensors(bundle: Bundle) -> dict[str, np.ndarray | None]:
     grid = bundle.grid
+    if grid.is_mesh:
+        return {"faces": grid.faces}
     return {
         "pixels": grid.pixels,
         "faces": grid.faces,

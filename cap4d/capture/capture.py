@@ -286,7 +286,7 @@ def _views(path: Path, fit: _Fit, cameras: dict[str, Camera], frames: int) -> tu
     files = {name: _image_files(path / "images" / name) for name in cameras}
     listing = path / "reference_images.json"
     if listing.exists():
-        wanted = _read_listing(listing, cameras, frames)
+        wanted = read_listing(listing, cameras, frames)
     else:
         valid = fit.flags("valid_mask", (len(cameras), frames))
         wanted = [
@@ -308,7 +308,12 @@ def _views(path: Path, fit: _Fit, cameras: dict[str, Camera], frames: int) -> tu
     return tuple(views)
 
 
-def _read_listing(listing: Path, cameras: dict[str, Camera], frames: int) -> list[tuple[str, int]]:
+def read_listing(listing: Path, cameras: Mapping[str, Camera], frames: int) -> list[tuple[str, int]]:
+    """(camera, frame) pairs of a reference_images.json; every name and number is checked.
+
+    Raises:
+        DataError: It is not such a list.
+    """
     try:
         entries = json.loads(listing.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:

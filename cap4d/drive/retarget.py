@@ -54,7 +54,7 @@ class Retargeter:
         grid, subject = bundle.grid, bundle.subject
         self.rig_name, self.count = bundle.rig_name, count
         covered = (grid.vertices < count).all(1)
-        weights = {driver: np.zeros(len(grid.pixels)) for driver in ("eyes", "expr")}
+        weights = {driver: np.zeros(len(grid)) for driver in ("eyes", "expr")}
         for j, driver in enumerate(subject.joint_drivers):
             if driver in weights:
                 weights[driver] += subject.skin_weights[:, j]

@@ -58,8 +58,22 @@ def export_bundle(
 
 def make_bundle(model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Clip) -> Bundle:
     """The avatar as a player needs it. `clip` is the capture's, corrected or not."""
-    mesh_subject = rig.subject(capture.shape)
     camera = default_camera(capture, clip)
+    return bundle_of(model, rig=rig, shape=capture.shape, clip=clip, idle=idle_clip(clip, rig), camera=camera)
+
+
+def bundle_of(
+    model: AvatarModel, *, rig: HeadRig, shape: np.ndarray, clip: Clip, idle: Clip, camera: Camera
+) -> Bundle:
+    """The same without a capture.
+
+    Args:
+        shape: The identity.
+        clip: What its network is compared and made cheaper on, besides `idle`.
+        idle: What plays when nothing drives the avatar.
+        camera: The default view, in the head-fixed world.
+    """
+    mesh_subject = rig.subject(shape)
     local = {name: value.detach().numpy() for name, value in model.gaussians.items()}
     bundle = Bundle(
         rig_licence=rig.licence,
@@ -75,7 +89,7 @@ def make_bundle(model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Cli
         sh=np.concatenate([local["sh_dc"], local["sh_rest"]], 1),
         binding=model.binding.numpy().astype(np.int32),
         camera=camera,
-        idle=idle_clip(clip, rig),
+        idle=idle,
         preview=preview(model, clip, camera),
         mesh_subject=mesh_subject,
     )

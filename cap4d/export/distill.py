@@ -16,6 +16,7 @@ import numpy as np
 from cap4d.bundle.bundle import Bundle
 from cap4d.camera import opencv_from_rig
 from cap4d.export.expressions import Expressions, OwnExpressions, offset_maps
+from cap4d.track.progress import progress
 
 SHRINKAGES = tuple(10.0**k for k in range(-6, 1))  # of the sum of squares of each expression
 FOLDS = 4
@@ -48,7 +49,7 @@ def answers(bundle: Bundle, network: Network, expressions: Expressions) -> np.nd
     """float32[n, D, 3] m: what the network moves beyond its neutral answer, on the D deformable vertices."""
     deformable = bundle.grid.deformable
     still = bundle.deform_neutral[deformable]
-    maps = offset_maps(bundle, expressions)
+    maps = progress(offset_maps(bundle, expressions), "linear deformer", len(expressions))
     return np.stack([bundle.grid.from_map(network(m))[deformable] - still for m in maps])
 
 

@@ -19,6 +19,7 @@ from cap4d.bundle.float_unet import first_layer
 from cap4d.bundle.quantized_unet import SMALLEST_SCALE, check_quantized, depth
 from cap4d.bundle.unet_graph import layer_names
 from cap4d.export.unet_onnx import network_weights
+from cap4d.track.progress import progress
 
 LEAK = 0.2
 NORM_EPS = 1e-5
@@ -102,7 +103,7 @@ class _FloatNet:
     def ranges(self, offsets: torch.Tensor) -> dict[str, Range]:
         """Of what each layer hands to its activation, over offsets [B, 3, S, S]."""
         seen: dict[str, list[torch.Tensor]] = {}
-        for one in offsets:
+        for one in progress(offsets, "int8 deformer", len(offsets)):
             for name, value in self.forward(one).items():
                 seen.setdefault(name, []).append(torch.stack(value[0].flatten(1).aminmax(dim=1)))
         stacked = {name: torch.stack(values) for name, values in seen.items()}  # [B, 2, C]

@@ -16,6 +16,7 @@ from cap4d.export.distill import distill
 from cap4d.export.expressions import Expressions, OwnExpressions, offset_maps, own_expressions
 from cap4d.player.avatar import Avatar
 from cap4d.player.deformer import Deformer
+from cap4d.track.progress import progress
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +72,7 @@ def vertices(bundle: Bundle, tier: str, expressions: Expressions) -> np.ndarray:
     """float32[n, D, 3] m the deformable vertices as the player poses them."""
     avatar, deformable = Avatar(bundle, deformer=tier), bundle.grid.deformable
     moments = zip(expressions.expr, expressions.eye_rot, expressions.jaw_rot, strict=True)
+    moments = progress(moments, f"checking the {tier} deformer", len(expressions))
     return np.stack([avatar.vertices(e, eye_rot=eyes, jaw_rot=jaw)[deformable] for e, eyes, jaw in moments])
 
 

@@ -77,7 +77,7 @@ def file_path(path: Path, size: tuple[int, int] | None) -> CameraPath:
     """
     if not path.is_file():
         raise ArgumentError(f"camera: expected static, orbit or an .npz of cameras, got {path}")
-    cameras = [fitted(camera, size) for camera in _read_cameras(path)]
+    cameras = [fitted(camera, size) for camera in read_cameras(path)]
 
     def at(index: int, frame: Frame) -> Camera:
         camera = cameras[index % len(cameras)]
@@ -122,7 +122,12 @@ def fitted(camera: Camera, size: tuple[int, int] | None) -> Camera:
     return replace(camera, K=K, width=width, height=height)
 
 
-def _read_cameras(path: Path) -> list[Camera]:
+def read_cameras(path: Path) -> list[Camera]:
+    """The cameras of a trajectory, or the first one of a fit.npz, in the world.
+
+    Raises:
+        DataError: The file is not sound.
+    """
     arrays = read_npz(path, names=CAMERA_FIELDS)
     is_fit = "resolution" not in arrays
     extr = checked(path, "extr", arrays.get("extr"), kind="float", shape=(None, 4, 4)).astype(np.float64)

@@ -37,20 +37,21 @@ class Surface:
             neutral = neutral + subject.pose_offset
         if subject.pose_basis is not None:
             basis.append(subject.pose_basis)
-        self._pixels = np.ascontiguousarray(
-            grid.pixels[:, 0].astype(np.int32) * grid.size + grid.pixels[:, 1]
-        )
+        # The rig's own triangles have no map: one pixel stands in, which nothing reads or writes.
+        size = max(1, grid.size)
+        pixels = np.zeros((len(grid), 2), np.int16) if grid.is_mesh else grid.pixels
+        self._pixels = np.ascontiguousarray(pixels[:, 0].astype(np.int32) * size + pixels[:, 1])
         self._core = _core.GridSurface(
             _floats(neutral),
             _floats(np.concatenate(basis)),
             _floats(subject.skin_weights.T),
             self._pixels,
-            grid.size,
+            size,
             np.ascontiguousarray(grid.deformable),
             _floats(bundle.deform_neutral),
         )
         self._coefficients, self._late = (np.zeros(sum(map(len, basis)), np.float32) for _ in range(2))
-        self._offsets = np.zeros((3, grid.size, grid.size), np.float32)
+        self._offsets = np.zeros((3, size, size), np.float32)
         self._zero = np.zeros(self._expressions, np.float32)
         self._neutral_answer, self._deformable = bundle.deform_neutral, bundle.grid.deformable
         self._linear = None if subject is bundle.subject else bundle.deform_linear  # what the tier folds in

@@ -1,4 +1,5 @@
-"""The UV grid: a rig's surface resampled on a square image, so that a convolution can move it (facts 16-19).
+"""The surface that carries an avatar's Gaussians: as a rule the UV grid, a rig's surface resampled on a
+square image, so that a convolution can move it (facts 16-19); or the rig's own triangles.
 
 Pixel (row, column) of a grid of S x S is the surface point at v = (row + 0.5) / S, u = 1 - (column + 0.5) /
 S: the texture turned by 180 degrees, as the released system has it. The map from rig vertices to grid
@@ -20,14 +21,19 @@ from cap4d.rotation import Array, namespace
 
 Model = TypeVar("Model", HeadRig, Subject)
 
+NO_AREA = 1e-12  # m^2: a triangle a micrometre across
+
 
 @dataclass(frozen=True, eq=False)
 class UvGrid:
     """A fixed remesh of a rig; G is the number of pixels that lie on the surface, M the number of triangles.
 
+    The rig's own triangles are one of size 0: its vertices are the rig's, none lies on a pixel, and no
+    network can see or move them.
+
     Args:
-        size: S, pixels a side.
-        pixels: int16[G, 2] row and column of each grid vertex, in scan order.
+        size: S, pixels a side; 0: the rig's own triangles.
+        pixels: int16[G, 2] row and column of each grid vertex, in scan order; [0, 2] of size 0.
         faces: int32[M, 3] into the G grid vertices, in the order of fact 18 (Gaussians are bound by face
             index).
         deformable: bool[G] where the deformation network may move the surface with the expression (fact 19).
@@ -43,7 +49,12 @@ class UvGrid:
     bary: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.pixels)
+        return len(self.vertices)
+
+    @property
+    def is_mesh(self) -> bool:
+        """Whether it is the rig's own triangles, without pixels."""
+        return self.size == 0
 
     def to_map(self, values: Array) -> Array:
         """[..., G, C] values of the grid vertices -> [..., C, S, S] image, zero off the surface."""
@@ -100,6 +111,38 @@ def build_grid(rig: HeadRig, size: int = 128) -> UvGrid:
         deformable=deformable[rig.faces[face]].all(1),
         vertices=rig.faces[face].astype(np.int32),
         bary=bary[valid].astype(np.float32),
+    )
+
+
+def own_triangles(rig: HeadRig) -> UvGrid:
+    """The rig's own mesh, as GaussianAvatars uses it (Qian et al. 2024): needs no UVs and takes no network.
+
+    Left out are triangles that have no area, which have no frame for a Gaussian (seams that only hold an
+    atlas together, both ends of a half-sphere), and those that lie on another of the same corners, whichever
+    way they face: the two sides of one triangle would be fitted twice.
+
+    Raises:
+        ArgumentError: The rig has no triangle with an area.
+    """
+    faces = np.asarray(rig.faces, np.int32)
+    corners = rig.template.astype(np.float64)[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    kept = np.flatnonzero(np.linalg.norm(normals, axis=1) > 2 * NO_AREA)
+    first = np.unique(np.sort(faces[kept], axis=1), axis=0, return_index=True)[1]
+    if not len(first):
+        raise ArgumentError(f"{rig.name}: expected triangles that have an area, got {len(faces)} without")
+    return mesh_grid(faces[kept[np.sort(first)]], len(rig.template))
+
+
+def mesh_grid(faces: np.ndarray, points: int) -> UvGrid:
+    """A mesh as a surface of size 0: int[M, 3] triangles into `points` vertices, which mix nothing."""
+    return UvGrid(
+        size=0,
+        pixels=np.zeros((0, 2), np.int16),
+        faces=np.ascontiguousarray(faces, np.int32),
+        deformable=np.zeros(points, bool),
+        vertices=np.repeat(np.arange(points, dtype=np.int32)[:, None], 3, axis=1),
+        bary=np.tile(np.float32([1, 0, 0]), (points, 1)),
     )
 
 

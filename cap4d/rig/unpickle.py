@@ -59,7 +59,15 @@ class _Dtype(_Record):
     pass
 
 
-class _Array(_Record):
+class NumpyRecord(_Record):
+    """A NumPy array, or one number of NumPy's; see `numpy_value`."""
+
+
+class _Array(NumpyRecord):
+    pass
+
+
+class _Scalar(NumpyRecord):
     pass
 
 
@@ -92,14 +100,20 @@ def _reconstruct(kind: type, *_: Any) -> _Record:
     return kind()
 
 
-_NAMES: dict[str, Any] = {
+NUMPY_NAMES: dict[str, Any] = {
     "numpy.dtype": _Dtype,
     "numpy.ndarray": _Array,
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy._core.multiarray._reconstruct": _reconstruct,
+    "numpy.core.multiarray.scalar": _Scalar,
+    "numpy._core.multiarray.scalar": _Scalar,
     "_codecs.encode": _encode,
     "__builtin__.bytes": _no_bytes,
     "builtins.bytes": _no_bytes,
+}
+"""What a pickle may name for arrays and numbers of NumPy's."""
+
+_NAMES: dict[str, Any] = NUMPY_NAMES | {
     "copy_reg._reconstructor": _reconstruct,
     "copyreg._reconstructor": _reconstruct,
     "__builtin__.object": _Record,
@@ -111,6 +125,7 @@ _NAMES: dict[str, Any] = {
 _NAMES |= {f"scipy.sparse.{module}.csc_matrix": _Columns for module in ("csc", "_csc")}
 _NAMES |= {f"scipy.sparse.{module}.csr_matrix": _Rows for module in ("csr", "_csr")}
 
+_MISFITS = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError)
 _BROKEN = (
     pickle.UnpicklingError,
     ArithmeticError,
@@ -139,6 +154,18 @@ class _Unpickler(pickle.Unpickler):
         return _NAMES[full_name]
 
 
+def numpy_value(path: Path, key: str, record: NumpyRecord) -> np.ndarray:
+    """The array that a record of NumPy's describes; a number is one without dimensions.
+
+    Raises:
+        DataError: Naming `key`: it does not fit together, or is not of plain numbers.
+    """
+    try:
+        return _number(record) if isinstance(record, _Scalar) else _array(record)
+    except _MISFITS as error:
+        raise DataError(path, key, expected="an array", found=repr(error)) from error
+
+
 def _plain(path: Path, key: str, value: Any) -> Any:
     try:
         if isinstance(value, _Chumpy):
@@ -147,9 +174,18 @@ def _plain(path: Path, key: str, value: Any) -> Any:
             return _array(value)
         if isinstance(value, (_Columns, _Rows)):
             return _dense(value)
-    except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
+    except _MISFITS as error:
         raise DataError(path, key, expected="an array", found=repr(error)) from error
     return value if isinstance(value, (str, bytes, int, float)) else None
+
+
+def _number(record: _Scalar) -> np.ndarray:
+    """NumPy's own arguments: (dtype, bytes)."""
+    dtype, data = record.args
+    element = _element(dtype)
+    if not isinstance(data, bytes) or len(data) != element.itemsize:
+        raise ValueError(f"one {element} in {len(data)} bytes")
+    return np.frombuffer(bytearray(data), element).reshape(())
 
 
 def _array(record: _Array) -> np.ndarray:

@@ -40,7 +40,7 @@ class Detector:
     """
 
     def __init__(self, *, video: bool, copies: int = len(WOBBLES)) -> None:
-        self._solutions = _import_mediapipe().solutions
+        self._solutions = import_mediapipe().solutions
         settings = dict(static_image_mode=not video, refine_landmarks=True, max_num_faces=1)
         self._meshes = [self._solutions.face_mesh.FaceMesh(**settings) for _ in WOBBLES[:copies]]
         self._segmenter = None
@@ -113,7 +113,7 @@ def _pass_on(reading: int, writing: int) -> None:
                 os.write(writing, line)
 
 
-def _import_mediapipe() -> ModuleType:
+def import_mediapipe() -> ModuleType:
     """MediaPipe with today's protobuf: it asks the message factory for what is now called GetMessageClass.
 
     The protobuf release notes of 4.22 and 5.26 deprecate and remove `MessageFactory.GetPrototype`.

@@ -18,7 +18,7 @@ def progress(items: Iterable[T], label: str, count: int) -> Iterator[T]:
     start = said = time.monotonic()
     for done, item in enumerate(items):
         now = time.monotonic()
-        if now - said > PERIOD:
+        if done and now - said > PERIOD:
             said = now
             left = f"/{count}, {(now - start) / done * (count - done):.0f} s left" if count > done else ""
             log.info("%s: %d%s", label, done, left)

@@ -146,17 +146,17 @@ void upright(const TriangleFrame& frame, float* rotmat) {
 namespace {
 
 // Rows grouped by a key in [0, keys): those of key k are items[starts[k]..starts[k + 1]), in ascending order. So sums over a group
-// have one order, whatever the number of threads.
+// have one order, whatever the number of threads. Fewer than 2^32 rows.
 struct Groups {
-  std::vector<std::size_t> starts, items;
+  std::vector<std::uint32_t> starts, items;
 };
 
 template <class Key>
 Groups group_by(std::size_t count, std::size_t keys, const Key& key_of) {
-  Groups g{std::vector<std::size_t>(keys + 1), std::vector<std::size_t>(count)};
+  Groups g{std::vector<std::uint32_t>(keys + 1), std::vector<std::uint32_t>(count)};
   for (std::size_t i = 0; i < count; ++i) ++g.starts[key_of(i) + 1];
   for (std::size_t k = 0; k < keys; ++k) g.starts[k + 1] += g.starts[k];
-  std::vector<std::size_t> next(g.starts.begin(), g.starts.end() - 1);
+  std::vector<std::uint32_t> next(g.starts.begin(), g.starts.end() - 1);
   for (std::size_t i = 0; i < count; ++i) g.items[next[key_of(i)]++] = i;
   return g;
 }

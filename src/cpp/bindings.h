@@ -9,6 +9,7 @@ void register_grid_surface(pybind11::module_& m);
 void register_lit_surface(pybind11::module_& m);
 void register_mesh(pybind11::module_& m);
 void register_render(pybind11::module_& m);
+void register_similarity(pybind11::module_& m);
 void register_sort(pybind11::module_& m);
 void register_splatter(pybind11::module_& m);
 void register_strands(pybind11::module_& m);

@@ -9,6 +9,7 @@ PYBIND11_MODULE(_core, m) {
   cap4d::register_lit_surface(m);
   cap4d::register_mesh(m);
   cap4d::register_render(m);
+  cap4d::register_similarity(m);
   cap4d::register_sort(m);
   cap4d::register_splatter(m);
   cap4d::register_strands(m);

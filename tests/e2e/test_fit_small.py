@@ -15,6 +15,7 @@ from cap4d.avatar.presets import PRESETS, Densify
 from cap4d.bundle import read_bundle
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError, DataError
+from cap4d.player.avatar import Avatar
 
 STEPS = 120
 TINY = replace(
@@ -151,6 +152,23 @@ def test_without_the_network_a_bundle_has_none(capture, tmp_path):
     bundle = read_bundle(output)
     assert bundle.deform_onnx is None
     assert not bundle.deform_neutral.any()
+
+
+def test_on_the_rigs_own_triangles(capture, tmp_path):
+    """Plain GaussianAvatars: another surface, no network, the same losses."""
+    rig, output = tiny_rig(), tmp_path / "plain.cap4d"
+    report = fit([capture], rig, output, preset=TINY, ablate="remesh")
+    assert report.ablate == "remesh"
+    assert report.held_out_psnr > report.nearest_frame_psnr + 2
+    bundle = read_bundle(output)
+    assert np.array_equal(bundle.grid.faces, rig.faces) and bundle.grid.is_mesh
+    assert bundle.tiers == ("off",)
+    assert np.unique(bundle.binding).size == len(rig.faces)  # none is left bare
+    avatar = Avatar(bundle)
+    moved = avatar.vertices(np.float32([1, 0])) - avatar.vertices(np.float32([0, 0]))
+    np.testing.assert_allclose(moved, rig.expression_basis[0] * np.float32([1, -1, -1]), atol=1e-7)
+    frames = [avatar.draw(avatar.idle.frame(t), avatar.camera) for t in (0, len(avatar.idle) // 2)]
+    assert all(frame[..., 3].max() > 200 for frame in frames)
 
 
 def test_captures_and_names_that_do_not_fit_are_refused(capture, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
-from tiny_bundle import tiny_bundle
+from tiny_bundle import tiny_bundle, tiny_bundle_on_mesh
 
 from cap4d import Avatar
 from cap4d.bundle import read_bundle, read_manifest, write_bundle
@@ -95,3 +95,12 @@ def test_interrupting_leaves_nothing(path: Path, tmp_path: Path, monkeypatch: py
     for output in (kept, tmp_path / "new.cap4d"):
         assert main(["optimize", str(path), "--max-error", "40dB", "-o", str(output)]) == 130
     assert [p.name for p in tmp_path.iterdir()] == ["kept.cap4d"] and kept.read_bytes() == b"before"
+
+
+def test_an_avatar_on_the_rigs_own_triangles_is_made_smaller(tmp_path: Path) -> None:
+    source, output = tmp_path / "a.cap4d", tmp_path / "b.cap4d"
+    write_bundle(tiny_bundle_on_mesh(8, gaussians=2), source)
+    assert main(["optimize", str(source), "--max-error", "35dB", "-o", str(output)]) == 0
+    small = read_bundle(output)
+    assert output.stat().st_size < 0.7 * source.stat().st_size
+    assert small.grid.is_mesh and len(small) < 2 * 98

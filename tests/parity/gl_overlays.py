@@ -13,6 +13,7 @@ from tiny_bundle import tiny_bundle
 
 from cap4d.camera import Camera
 from cap4d.player.avatar import Avatar
+from cap4d.rig.grid import mesh_grid
 
 FACES = 12  # single triangles that are drawn alone
 CLOSE = 0.56  # m
@@ -72,6 +73,10 @@ def draw_on_gl(output: str) -> None:
     found["lone mesh"] = surface(grid.faces[lone_faces()[3]][None], 0, "overlay_mesh")
     inside_out = grid.faces[lone_faces()[3]][None, ::-1]
     found["inside out"] = surface(np.ascontiguousarray(inside_out), 0, "overlay_mesh")
+    wire = SurfacePass(ctx, mesh_grid(grid.faces[lone_faces()[3]][None], len(grid)), samples=0)
+    wire.begin(vertices, camera)
+    wire.draw("overlay_wire")
+    found["lone wire"] = pixels(wire.end())
     found["outline"] = surface(grid.faces, 0)[..., 3]
 
     for renderer in (GlRenderer(ctx, player), CpuRenderer(ctx, player, background=None)):

@@ -71,9 +71,10 @@ def test_triangles_are_where_splats_are(found, vertices):
         assert np.abs(middle(found[f"face {index} 4"].astype(float)) - splat_middle(point)).max() < 0.5
 
 
-def test_lines_are_the_edges(found, vertices):
+@pytest.mark.parametrize("kind", ["mesh", "wire"])
+def test_lines_are_the_edges(kind, found, vertices):
     """Corners and middles of edges are on lines, to the pixel; the triangle's middle is not."""
-    line, corners = found["lone mesh"][..., 3], corners_of(lone_faces()[3], vertices)
+    line, corners = found[f"lone {kind}"][..., 3], corners_of(lone_faces()[3], vertices)
     for x, y in [*corners, *(corners + np.roll(corners, 1, 0)) / 2]:
         assert line[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2].max() > 120
     x, y = corners.mean(0)

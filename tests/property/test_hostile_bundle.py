@@ -18,7 +18,7 @@ pytest.importorskip("onnx")
 import onnx
 from bundle_forge import Forge
 from quantized_reference import random_network
-from tiny_bundle import tiny_bundle
+from tiny_bundle import tiny_bundle, tiny_bundle_on_mesh
 
 from cap4d.bundle import Bundle, read_bundle, write_bundle
 from cap4d.bundle.container import CENTRAL_MAGIC, LOCAL_MAGIC
@@ -210,6 +210,12 @@ def vast_grid(**counts: int) -> Callable[[Forge], None]:
     return lambda forge: forge.manifest["counts"].update(grid_size=1024, grid_vertices=1 << 20, **counts)
 
 
+def no_grid(forge: Forge) -> None:
+    """Says that the Gaussians ride on the rig's own triangles."""
+    on_mesh_of(forge.manifest["counts"]["grid_vertices"])(forge)
+    forge.manifest["counts"]["grid_size"] = 0
+
+
 MANIFESTS = {
     "not_json": (raw(lambda t: t[:-1]), "JSON"),
     "not_text": (lambda f: setattr(f, "raw_manifest", b"\xff\xfe{}"), "JSON"),
@@ -220,7 +226,7 @@ MANIFESTS = {
     "endless_number": (raw(lambda t: t.replace('"version": 1', '"version": ' + "1" * 5000)), "JSON"),
     "too_large": (raw(lambda t: t + " " * (1 << 20)), "size"),
     "another_format": (put("gltf", "format"), "format"),
-    "newer": (put(3, "version"), "version"),
+    "newer": (put(4, "version"), "version"),
     "version_zero": (put(0, "version"), "version"),
     "version_text": (put("1", "version"), "version"),
     "version_flag": (put(True, "version"), "version"),
@@ -252,6 +258,8 @@ MANIFESTS = {
     "count_huge": (put(1 << 40, "counts", "gaussians"), "counts.gaussians"),
     "count_fraction": (put(1.5, "counts", "faces"), "counts.faces"),
     "count_sh": (put(5, "counts", "sh_coefficients"), "counts.sh_coefficients"),
+    "count_small_grid": (put(7, "counts", "grid_size"), "counts.grid_size"),
+    "no_grid_in_version_1": (no_grid, "version"),
     "count_grid": (put(65, "counts", "grid_vertices"), "counts.grid_vertices"),
     "camera_size": (put(0, "camera", "width"), "camera.width"),
     "camera_huge": (put(1 << 20, "camera", "height"), "camera.height"),
@@ -810,3 +818,80 @@ def test_commands_refuse_in_one_line_and_write_nothing(
     assert code == 1 and len(lines) == 1, lines
     assert f"{path}" in lines[0] and ": expected " in lines[0] and ", found " in lines[0]
     assert [p.name for p in tmp_path.iterdir()] == ["bad.cap4d"]
+
+
+# Version 3 ------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def gridless(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound file whose Gaussians ride on the rig's own triangles."""
+    path = tmp_path_factory.mktemp("gridless") / "gridless.cap4d"
+    write_bundle(tiny_bundle_on_mesh(SIZE, gaussians=1), path)
+    return path
+
+
+def with_entry(name: str) -> Callable[[Forge], None]:
+    """A file with one more entry, listed and signed."""
+
+    def change(forge: Forge) -> None:
+        forge.entries[name] = b"x"
+        forge.sign()
+
+    return change
+
+
+GRIDLESS_MANIFESTS = {
+    "version_2": (put(2, "version"), "version"),
+    "on_the_grid": (put("grid", "rig", "points"), "rig.points"),
+    "vertices": (put(63, "counts", "grid_vertices"), "counts.grid_vertices"),
+    "points": (put(63, "counts", "rig_points"), "counts.rig_points"),
+    "with_a_grid": (put(SIZE, "counts", "grid_size"), "counts.rig_points"),
+    "network": (with_entry(ONNX), f"entries.{ONNX}"),
+    "network_in_whole_numbers": (with_entry(INT8), f"entries.{INT8}"),
+    "tiers": (put({"off": {"rms_mm": 1, "max_mm": 2}}, "deformer"), "deformer"),
+    "posing_bomb": (
+        lambda f: f.manifest["counts"].update(
+            grid_vertices=1 << 20, rig_points=1 << 20, rig_vertices=1 << 20, joints=64
+        ),
+        "counts.joints",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GRIDLESS_MANIFESTS)
+def test_manifest_without_a_grid(name: str, gridless: Path, tmp_path: Path) -> None:
+    change, field = GRIDLESS_MANIFESTS[name]
+    forge, path = Forge(gridless), tmp_path / "bad.cap4d"
+    change(forge)
+    forge.write(path)
+    assert refusal(path).field == field
+
+
+GRIDLESS_TENSORS = {
+    "pixels": (added(GRID, "pixels", np.zeros((64, 2), np.uint16)), "tensors"),
+    "bary": (added(GRID, "bary", np.full((64, 3), 1 / 3, np.float32)), "tensors"),
+    "deform_neutral": (added(GRID, "deform_neutral", np.zeros((64, 3), np.float32)), "tensors"),
+    "lines": (added(GRID, "deform_linear", np.zeros((5, 64, 3), np.float32)), "tensors"),
+    "masked_lines": (
+        (GRID, lambda t: t.update({"deform_linear": np.zeros((0, 3), np.float32),
+                                   "deform_linear.mask": np.zeros((5, 8), np.uint8)})),
+        "tensors",
+    ),
+    "face_beyond": (at(GRID, "faces", (0, 0), 64), "faces"),
+    "face_repeats": (remade(GRID, "faces", lambda v: v[:, [0, 0, 1]]), "faces"),
+    "no_faces": ((GRID, lambda t: t.pop("faces")), "faces"),
+    "binding_beyond": (at(GAUSSIANS, "binding", 0, 98), "binding"),
+    "fewer_points": (remade(RIG, "neutral", lambda v: v[:-1]), "neutral"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GRIDLESS_TENSORS)
+def test_tensors_without_a_grid(name: str, gridless: Path, tmp_path: Path) -> None:
+    (entry, change), field = GRIDLESS_TENSORS[name]
+    forge, path = Forge(gridless), tmp_path / "bad.cap4d"
+    forge.tensors(entry, change)
+    forge.sign()
+    forge.write(path)
+    error = refusal(path)
+    assert error.field == field and error.source == f"{path}:{entry}"

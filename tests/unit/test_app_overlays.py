@@ -8,16 +8,18 @@ import pytest
 pytest.importorskip("onnx")
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from cap4d.app.background import Backdrop, Checkerboard
 from cap4d.app.layout import Rect
 from cap4d.app.overlays.color_map import color_map
 from cap4d.app.overlays.legend import Legend, rounded_up, ticks
-from cap4d.app.overlays.overlays import Overlay, Overlays, Part
+from cap4d.app.overlays.overlays import Overlay, Overlays, Part, why_not
 from cap4d.app.panels.legends import draw_legends
+from cap4d.app.panels.overlays import draw_overlays
 from cap4d.app.renderers import CpuRenderer, GlRenderer
 from imgui_bundle import imgui
-from tiny_bundle import tiny_bundle
+from tiny_bundle import tiny_bundle, tiny_bundle_on_mesh
 
 from cap4d.player.avatar import Avatar
 
@@ -158,6 +160,55 @@ def test_legends_are_drawn() -> None:
                 imgui.render()
             corners.append(imgui.get_draw_data().total_vtx_count)
         assert corners[0] == 0 and corners[1] > 4 * 16 + 4 * len("Gaussiansperpixel")
+    finally:
+        for texture in imgui.get_platform_io().textures:
+            texture.set_status(imgui.ImTextureStatus.destroyed)
+        imgui.destroy_context(context)
+
+
+# Without a grid ------------------------------------------------------------
+
+
+def test_the_rigs_own_triangles_have_a_mesh_and_no_uv_grid(ctx) -> None:
+    avatar = Avatar(tiny_bundle_on_mesh())
+    reasons = {overlay: why_not(overlay, avatar.bundle) for overlay in Overlay}
+    assert "no UV grid" in reasons[Overlay.UV] and "no network" in reasons[Overlay.DEFORMATION]
+    assert reasons[Overlay.MESH] == reasons[Overlay.DENSITY] == ""
+    assert not any(why_not(overlay, tiny_bundle(network=False)) for overlay in Overlay)
+    renderer, overlays = CpuRenderer(ctx, avatar), Overlays(ctx, avatar)
+    renderer.texture(avatar.idle.frame(1), avatar.camera)
+    target, pictures = ctx.simple_framebuffer((48, 48)), []
+    for shown in (set(), {Overlay.UV, Overlay.DEFORMATION}, {Overlay.MESH}, set(Overlay) - {Overlay.DENSITY}):
+        target.use()
+        target.clear()
+        overlays.shown = shown
+        overlays.draw(renderer, avatar.camera.resized(48, 48))
+        pictures.append(target.read())
+        assert overlays.legends() == []
+    assert pictures[0] == pictures[1] != pictures[2] == pictures[3]
+    assert ctx.error == "GL_NO_ERROR"
+
+
+def test_the_panel_offers_what_the_avatar_has() -> None:
+    context = imgui.create_context()
+    try:
+        io = imgui.get_io()
+        io.set_ini_filename("")
+        io.display_size = imgui.ImVec2(400, 300)
+        io.backend_flags |= imgui.BackendFlags_.renderer_has_textures
+        corners = []
+        for bundle in (tiny_bundle(network=False), tiny_bundle_on_mesh()):
+            viewer = SimpleNamespace(
+                avatar=Avatar(bundle), overlays=frozenset(Overlay), overlay_part=Part.ALL
+            )
+            imgui.new_frame()
+            draw_overlays(viewer)
+            imgui.render()
+            corners.append(imgui.get_draw_data().total_vtx_count)
+            assert viewer.overlays == frozenset(Overlay)  # kept for the next avatar
+        assert corners[1] < corners[0] - 2 * 4 * len(
+            "Bytheexpression"
+        )  # two ticks less, and no parts to choose
     finally:
         for texture in imgui.get_platform_io().textures:
             texture.set_status(imgui.ImTextureStatus.destroyed)

@@ -1,11 +1,13 @@
 """Corrections are functions of the sequence: zero at first, shared by neighbours, never of one image."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 import torch
 from tiny_avatar import write_tiny_capture
 
-from cap4d.avatar.corrections import Corrections
+from cap4d.avatar.corrections import Corrections, NeckOffsets, Uncorrected, corrections_named
 from cap4d.camera import head_fixed
 from cap4d.capture.capture import Capture
 
@@ -30,7 +32,7 @@ def test_they_start_at_what_was_tracked(capture, corrections):
     torch.testing.assert_close(c.pose.expr, torch.from_numpy(capture.expr[5]))
     torch.testing.assert_close(c.rigid[0], torch.eye(3))
     assert c.rigid[1].abs().max() < 1e-7
-    assert not corrections.penalty().detach().any()
+    assert not corrections.penalty(0).detach().any()
 
 
 def test_a_held_out_frame_gets_its_neighbours_correction(corrections):
@@ -85,3 +87,53 @@ def test_the_corrected_clip_sees_what_the_corrected_view_sees(capture, correctio
     found = points @ corrected[:3, :3].T + corrected[:3, 3]
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert np.abs(clip.rot - capture.rot).max() > 1e-3
+
+
+def test_neck_offsets_turn_the_neck_of_one_frame_and_are_kept(capture):
+    neck = NeckOffsets(capture)
+    assert float(neck.penalty(4).detach()) == 0
+    optimizer = torch.optim.Adam(neck.parameters(), lr=0.01)
+    for frame in (4, 4, 7):
+        wanted = torch.tensor([0.1, 0.0, 0.0])
+        optimizer.zero_grad(set_to_none=True)
+        (neck.at(frame).pose.neck_rot - wanted).square().sum().backward()
+        optimizer.step()
+    moved = [t for t in range(len(capture)) if neck.offsets[t].detach().any()]
+    assert moved == [4, 7]
+    assert float(neck.penalty(4).detach()) == pytest.approx(0.02, rel=0.01)
+    clip = neck.corrected(capture.clip())
+    added = clip.neck_rot - capture.neck_rot
+    np.testing.assert_allclose(added[4], [0.02, 0, 0], atol=1e-4)
+    assert not np.delete(added, [4, 7], axis=0).any()
+    assert np.array_equal(clip.expr, capture.expr)
+    assert neck.at(4).rigid is None
+
+
+def test_a_neck_at_rest_has_a_finite_gradient(capture):
+    neck = NeckOffsets(capture)
+    neck.penalty(2).backward()
+    assert not neck.offsets[2].grad.any()
+
+
+def test_trusted_parameters_stay_as_they_were_tracked(capture):
+    trusted = Uncorrected(capture)
+    assert not list(trusted.parameters())
+    assert float(trusted.penalty(0)) == 0
+    pose = trusted.at(6).pose
+    for name in ("expr", "eye_rot", "neck_rot", "jaw_rot"):
+        assert np.array_equal(getattr(pose, name).numpy(), getattr(capture, name)[6])
+    clip = capture.clip()
+    assert trusted.corrected(clip) is clip
+
+
+def test_which_corrections_a_name_means(capture):
+    calibrated = copy(capture)
+    object.__setattr__(calibrated, "cameras", {"left": None, "right": None})
+    arguments = np.ones(len(capture), bool), np.zeros(3)
+    made = {
+        name: type(corrections_named(name, capture, *arguments, video=True))
+        for name in ("auto", "tracked", "neck", "none")
+    }
+    assert made == {"auto": Corrections, "tracked": Corrections, "neck": NeckOffsets, "none": Uncorrected}
+    assert type(corrections_named("auto", calibrated, *arguments, video=False)) is Uncorrected
+    assert type(corrections_named("tracked", calibrated, *arguments, video=False)) is Corrections

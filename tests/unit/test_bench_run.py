@@ -7,13 +7,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny_bundle import tiny_bundle
+from tiny_bundle import tiny_bundle, tiny_bundle_on_mesh
 
 from cap4d import cli
 from cap4d.bundle import write_bundle
 from cap4d.errors import ArgumentError
 from cap4d.evaluate.bench import peers
 from cap4d.evaluate.bench.child import ChildError, in_child
+from cap4d.evaluate.bench.deforming import measure_deformer
 from cap4d.evaluate.bench.fitting import FUSED, TORCH
 from cap4d.evaluate.bench.plots import draw_plots
 from cap4d.evaluate.bench.run import parse_sections, try_plots
@@ -209,3 +210,9 @@ def test_gsplat_draws_the_same_picture_here() -> None:
     for name, peer in found.items():
         assert abs(peer.forward() - truth).max() < 0.01, name
     found["gsplat's PyTorch functions, pairs given"].forward_backward()
+
+
+def test_an_avatar_without_a_grid_has_no_deformer_to_measure(tmp_path: Path) -> None:
+    write_bundle(tiny_bundle_on_mesh(8, gaussians=1), tmp_path / "a.cap4d")
+    with pytest.raises(ArgumentError, match="expected an avatar on a UV grid"):
+        measure_deformer(tmp_path / "a.cap4d", Settings(quick=True))

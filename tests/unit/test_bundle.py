@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from quantized_reference import random_network
-from tiny_bundle import tiny_bundle, tiny_mesh
+from tiny_bundle import tiny_bundle, tiny_bundle_on_mesh, tiny_mesh
 
 from cap4d.bundle import Bundle, describe, read_bundle, read_manifest, schema, write_bundle
 from cap4d.bundle.onnx_scan import scan_onnx
@@ -416,3 +416,44 @@ def test_the_specification_names_everything_the_schema_does() -> None:
     names = [*schema.COUNTS, *schema.ENTRIES, *(name for specs in TENSORS.values() for name in specs)]
     assert not [name for name in names if f"`{name}`" not in text]
     assert f"version {schema.VERSION}" in text
+
+
+# Version 3 ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mesh", [True, False])
+def test_an_avatar_on_the_rigs_own_triangles_comes_back_bit_for_bit(mesh: bool, tmp_path: Path) -> None:
+    bundle = tiny_bundle_on_mesh()
+    write_bundle(bundle if mesh else replace(bundle, mesh_subject=None), tmp_path / "a.cap4d")
+    manifest = read_manifest(tmp_path / "a.cap4d")
+    assert (manifest.version, manifest.rig_points, manifest.counts["grid_size"]) == (3, "mesh", 0)
+    back = read_bundle(tmp_path / "a.cap4d")
+    assert back.subject is back.mesh_subject and back.tiers == ("off",)
+    assert_same(bundle, back)
+    text = describe(tmp_path / "a.cap4d")
+    assert "version 3" in text and "the rig's own triangles, 256 vertices, 450 faces" in text
+
+
+@pytest.mark.parametrize("precision", ["float16", dict.fromkeys(PACKED, "int8")])
+def test_the_rigs_own_triangles_in_every_precision(precision: object, tmp_path: Path) -> None:
+    bundle = tiny_bundle_on_mesh()
+    write_bundle(bundle, tmp_path / "a.cap4d", precision=precision)
+    back = read_bundle(tmp_path / "a.cap4d")
+    assert np.array_equal(back.grid.faces, bundle.grid.faces)
+    assert np.abs(back.means - bundle.means).max() < 4e-3
+    assert np.abs(back.subject.expression_basis - bundle.subject.expression_basis).max() < 1e-4
+
+
+def test_the_rigs_own_triangles_take_no_deformer(bundle: Bundle, tmp_path: Path) -> None:
+    on_mesh, path = tiny_bundle_on_mesh(), tmp_path / "a.cap4d"
+    changes = {
+        "deform_onnx": bundle.deform_onnx,
+        "deform_int8": random_network(16, 1),
+        "deform_linear": np.zeros_like(on_mesh.subject.expression_basis),
+        "deform_neutral": on_mesh.deform_neutral + 1,
+        "tier_errors": {"off": (0.0, 0.0)},
+    }
+    for name, value in changes.items():
+        with pytest.raises(ArgumentError, match=f"{name}: expected no.* on the rig's own triangles"):
+            write_bundle(replace(on_mesh, **{name: value}), path)
+    assert not list(tmp_path.iterdir())

@@ -28,12 +28,20 @@ def table():
     return Rows(model, optimizer), model.binding.clone()
 
 
-def run(rows, evidence, settings, per_face=1, room=1000):
+def run(rows, evidence, settings, per_face=1, room=1000, worth=None):
     faces = len(rows.model.faces)
     sizes = torch.full((faces,), 0.01)
     generator = torch.Generator().manual_seed(0)
     densify(
-        rows, evidence, settings, face_sizes=sizes, step=50, room=room, per_face=per_face, generator=generator
+        rows,
+        evidence,
+        settings,
+        face_sizes=sizes,
+        step=50,
+        room=room,
+        per_face=per_face,
+        generator=generator,
+        worth=worth,
     )
 
 
@@ -86,6 +94,53 @@ def test_splitting_replaces_the_parent_by_two_smaller_ones(table):
     means = rows.model.gaussians["means"][-2:]
     assert not torch.equal(means[0], means[1])
     check_alignment(rows, binding, fresh=2)
+
+
+def test_in_world_units_children_stay_where_their_parent_was(table):
+    """The released code's offset is a face size, here 1 cm, times too short (fact 30)."""
+    rows, _ = table
+    evidence = Evidence(len(rows.model))
+    evidence.seen += 1
+    evidence.gradient[5] = 5.0
+    parent = {name: value.detach()[5].clone() for name, value in rows.model.gaussians.items()}
+    everything = {n: p.detach().clone() for n, p in rows.model.gaussians.items()}
+    binding = rows.model.binding.clone()
+    offsets = {}
+    for units in ("local", "world"):
+        for name, value in everything.items():
+            rows.model.gaussians[name] = torch.nn.Parameter(value.clone())
+        rows.model.binding = binding.clone()
+        model = Rows(rows.model, torch.optim.Adam(rows.model.gaussians.values()))
+        run(model, evidence, replace(SETTINGS, split_scale=0.0, split_offset=units))
+        offsets[units] = rows.model.gaussians["means"][-2:].detach() - parent["means"]
+    torch.testing.assert_close(offsets["world"], 0.01 * offsets["local"], rtol=1e-4, atol=1e-7)
+    assert 0.2 < (offsets["local"] / parent["log_scales"].exp()).square().mean().sqrt() < 3
+
+
+def test_what_is_worth_least_goes_and_makes_room(table):
+    rows, binding = table
+    n = len(rows.model)
+    evidence = Evidence(n)
+    evidence.seen += 1
+    evidence.gradient[:20] = torch.arange(20.0) + 2
+    worth = torch.arange(n, dtype=torch.float32).flip(0)
+    few = int(0.01 * n)
+    run(rows, evidence, replace(SETTINGS, prune_least=0.01), per_face=0, room=3, worth=worth)
+    number = rows.model.gaussians["sh_dc"][:, 0, 0].detach()
+    assert len(number) == n + 3
+    assert set(range(n)) - set(number.int().tolist()) == set(range(n - few, n))
+    assert sorted(number[-3 - few :].tolist()) == list(range(20 - 3 - few, 20))
+    check_alignment(rows, binding, fresh=3 + few)
+
+
+def test_without_a_budget_the_threshold_alone_decides(table):
+    rows, _ = table
+    n = len(rows.model)
+    evidence = Evidence(n)
+    evidence.seen += 1
+    evidence.gradient[: n // 2] = 2.0
+    run(rows, evidence, SETTINGS, room=None)
+    assert len(rows.model) == n + n // 2
 
 
 def test_the_budget_takes_the_most_wanted(table):

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from cap4d.evaluate.image import mse, pooled_psnr, psnr, ssim
 
@@ -25,6 +26,22 @@ def test_ssim_is_one_for_equal_and_known_for_flat_images():
     assert ssim(image, image) == pytest.approx(1.0)
     a, b = np.full((16, 16, 3), 0.2), np.full((16, 16, 3), 0.6)
     assert ssim(a, b) == pytest.approx((2 * 0.2 * 0.6 + 1e-4) / (0.2**2 + 0.6**2 + 1e-4))
+
+
+@pytest.mark.parametrize("shape", [(11, 11, 3), (12, 43, 3), (75, 42, 1), (107, 64, 3)])
+def test_ssim_is_that_of_every_window(shape):
+    rng = np.random.default_rng(2)
+    image, truth = rng.random(shape), rng.random(shape)
+    x = np.arange(-5, 6)
+    weights = np.exp(-(x[:, None] ** 2 + x**2) / (2 * 1.5**2))
+    weights /= weights.sum()
+    a, b = (sliding_window_view(each, (11, 11), axis=(0, 1)) for each in (image, truth))
+    mean = lambda windows: np.einsum("...ij,ij", windows, weights)  # noqa: E731
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b, cov = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2, mean(a * b) - mean_a * mean_b
+    values = (2 * mean_a * mean_b + 1e-4) * (2 * cov + 9e-4)
+    values /= (mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4)
+    assert ssim(image, truth) == pytest.approx(values.mean(), abs=1e-12)
 
 
 def test_ssim_falls_with_noise():

@@ -11,7 +11,7 @@ import pytest
 
 from cap4d.errors import ArgumentError
 from cap4d.rig.flame import read_assets
-from cap4d.rig.grid import build_grid, remesh
+from cap4d.rig.grid import build_grid, mesh_grid, own_triangles, remesh
 from cap4d.rig.obj import read_obj, triangulate
 
 SIZE = 8
@@ -149,3 +149,41 @@ def test_a_remeshed_subject_is_the_remeshed_mesh(builtin_rig):
     np.testing.assert_allclose(on_grid, (mesh[grid.vertices] * grid.bary[..., None]).sum(1), atol=2e-6)
     also = remesh(builtin_rig.subject(shape), grid).pose(expr)
     np.testing.assert_allclose(also, on_grid, atol=2e-6)
+
+
+# The rig's own triangles ------------------------------------------------------------
+
+
+def test_own_triangles_stand_on_the_rigs_vertices(square):
+    grid = own_triangles(square)
+    assert grid.is_mesh and not build_grid(square, SIZE).is_mesh
+    assert len(grid) == 4 and not grid.deformable.any() and len(grid.pixels) == 0
+    np.testing.assert_array_equal(grid.faces, square.faces)
+    np.testing.assert_array_equal(positions(square, grid), square.template)  # to the bit
+
+
+def test_own_triangles_leave_out_what_has_no_area_and_second_sides():
+    corners = [[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0], [0, 0]]
+    faces = [
+        [0, 1, 2],
+        [0, 1, 1],  # a seam
+        [0, 4, 1],  # three in a line
+        [2, 1, 0],  # the other side of the first
+        [1, 2, 0],  # the first again
+        [0, 5, 2],  # two vertices in one place
+        [0, 2, 3],
+    ]
+    np.testing.assert_array_equal(own_triangles(flat_rig(corners, faces)).faces, [[0, 1, 2], [0, 2, 3]])
+    with pytest.raises(ArgumentError, match="triangles that have an area, got 2"):
+        own_triangles(flat_rig(corners, faces[1:3]))
+
+
+def test_own_triangles_need_no_uvs(square):
+    square.uvs, square.uv_faces = square.uvs[:0], square.uv_faces[:0]
+    assert len(own_triangles(square).faces) == 2
+
+
+def test_a_mesh_has_no_map(square):
+    grid = mesh_grid(square.faces, 4)
+    with pytest.raises(ValueError, match="shape"):
+        grid.to_map(np.ones((4, 3), np.float32))

@@ -108,3 +108,23 @@ def test_relative_rotation_has_a_gradient_at_rest():
     identity = torch.eye(3, dtype=torch.float64).expand(3, 3, 3)
     losses.relative_rotation_loss(axis_angle_to_rotmat(vectors), identity).backward()
     assert torch.isfinite(vectors.grad).all()
+
+
+def test_gradient_distance():
+    x, y = images(height=16, width=20)
+    d = (x - y).numpy()
+    expected = 0.0
+    for _ in range(3):
+        expected += np.abs(np.diff(d, axis=0)).mean() + np.abs(np.diff(d, axis=1)).mean()
+        h, w = d.shape[0] // 2, d.shape[1] // 2
+        d = d[: 2 * h, : 2 * w].reshape(h, 2, w, 2, 3).mean((1, 3))
+    assert abs(float(losses.gradient_distance(x, y)) - expected) < 1e-12
+    assert float(losses.gradient_distance(x, x)) == 0
+    assert float(losses.gradient_distance(x, x + 0.1)) < 1e-12  # a change of tone has no edges
+    leaf = x.clone().requires_grad_()
+    losses.gradient_distance(leaf, y).backward()
+    direction = torch.from_numpy(np.random.default_rng(5).normal(size=x.shape))
+    h = 1e-9  # too small for a difference to change its sign
+    ends = [losses.gradient_distance(x + s * h * direction, y) for s in (1, -1)]
+    slope = float(ends[0] - ends[1]) / (2 * h)
+    assert abs(float((leaf.grad * direction).sum()) - slope) < 1e-5 * abs(slope)

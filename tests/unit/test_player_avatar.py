@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
-from tiny_bundle import EXPRESSIONS, RIG_NAME, tiny_bundle
+from tiny_bundle import EXPRESSIONS, RIG_NAME, tiny_bundle, tiny_bundle_on_mesh
 
 import cap4d
 from cap4d.bundle import Bundle, write_bundle
@@ -75,6 +75,18 @@ def test_the_network_moves_only_what_is_deformable(avatar: Avatar, bundle: Bundl
 def test_an_avatar_without_a_network_plays(bundle: Bundle) -> None:
     bare = Avatar(replace(bundle, deform_onnx=None))
     assert np.array_equal(bare.vertices(OPEN), Avatar(bundle, deformer="off").vertices(OPEN))
+
+
+def test_an_avatar_on_the_rigs_own_triangles_plays() -> None:
+    bundle = tiny_bundle_on_mesh()
+    avatar, frame = Avatar(bundle), bundle.idle.frame(5)
+    turns = {"eye_rot": frame.eye_rot, "neck_rot": frame.neck_rot}
+    expected = bundle.subject.pose(frame.expr, **turns) * np.float32([1, -1, -1])
+    np.testing.assert_allclose(avatar.vertices(frame.expr, **turns), expected, atol=1e-7)
+    assert avatar.tier == "off" and not avatar.deformation().any()
+    assert np.ptp(avatar.render(frame.expr, **turns)[..., 3]) == 255
+    with pytest.raises(ArgumentError, match="deformer: expected one that avatar has"):
+        Avatar(bundle, deformer="full")
 
 
 def test_the_neck_bends_under_a_face_that_the_network_sees_unbent(avatar: Avatar, bundle: Bundle) -> None:

@@ -11,7 +11,8 @@ from cap4d.errors import ArgumentError
 from cap4d.mesh import rasterize_mesh
 from cap4d.rig.head import HeadRig
 from cap4d.rotation import axis_angle_to_rotmat
-from cap4d.synth.hair import Hair, HairLights, composite_hair, draw_hair, grow_hair
+from cap4d.synth.hair import Hair, HairLayer, HairLights, composite_hair, draw_hair, grow_hair
+from cap4d.synth.hair.face import LASHES
 from cap4d.synth.hair.style import STYLES, WEIGHTS
 
 RADII = np.array([0.078, 0.115, 0.1])  # m, of a head that is an ellipsoid
@@ -198,8 +199,6 @@ def test_hair_behind_the_camera_is_not_drawn(egg: HeadRig, hair: Hair) -> None:
 
 
 def test_compositing_keeps_what_is_bare_and_fills_mattes() -> None:
-    from cap4d.synth.hair import HairLayer
-
     alpha = np.float32([[0, 0.5, 1]])
     layer = HairLayer(alpha[..., None] * np.float32([0.2, 0.1, 0.0]), alpha)
     rgb, matte = composite_hair(np.full((1, 3, 3), 0.8), np.array([[1.0, 0.0, 0.4]]), layer)
@@ -219,7 +218,7 @@ def test_grows_on_the_builtin_rig(builtin_rig: HeadRig) -> None:
     hair = grow_hair(builtin_rig, builtin_rig.template, seed=0, style="crop", density=0.02)
     modelled = set(builtin_rig.regions["hair"].tolist())
     assert set(hair.roots.corners[~hair.skin].ravel().tolist()) <= modelled
-    lashes = hair.strands[-200:, 0]
+    lashes = hair.strands[-2 * LASHES :, 0]
     assert (np.abs(lashes[:, 1] - 0.02) < 0.02).all(), "lashes are not at the eyes"
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
+from cap4d.errors import ArgumentError
 from cap4d.evaluate.bench.accuracy import vertex_error_mm
 from cap4d.evaluate.bench.settings import Settings
 from cap4d.evaluate.bench.tiers import clip_frames, load_tiers, offset_maps, vertices_of
@@ -25,10 +26,16 @@ PLAIN, RESTING = "onnxruntime, as it comes", "onnxruntime, threads that do not s
 
 
 def measure_deformer(path: Path, settings: Settings) -> dict[str, Any]:
-    """One avatar: a row per tier, and the exported network in onnxruntime without us."""
+    """One avatar: a row per tier, and the exported network in onnxruntime without us.
+
+    Raises:
+        ArgumentError: An avatar on the rig's own triangles, which has none.
+    """
     log.info("deformer: %s", path)
     tiers = load_tiers(path, threads=settings.threads)
     bundle = next(iter(tiers.values())).bundle
+    if bundle.grid.is_mesh:
+        raise ArgumentError(f"{path}: expected an avatar on a UV grid, got one without a deformer to measure")
     frames = clip_frames(bundle, EXPRESSIONS)
     maps = offset_maps(bundle, frames)
     passes: dict[str, Callable[[], Any]] = {}

@@ -19,6 +19,7 @@ OPACITY = 0.85
 GLOSS, GLOSS_POWER, GLOSS_SHIFT = 0.9, 50.0, 0.06  # of the reflection at a strand's surface
 GLOW, GLOW_POWER, GLOW_SHIFT = 0.55, 14.0, -0.10  # of light that leaves it after a reflection inside
 
+SKIN_GLOSS = 0.2  # eyebrows and lashes shine this much as hair does
 TILT, GOLDEN = np.float32(0.16), np.float32(0.618034)  # scales of single hairs tilt differently
 
 
@@ -128,6 +129,7 @@ def light_hair(
         reached *= facing
         gloss += reached * _lobe(lean + GLOSS_SHIFT, GLOSS_POWER)
         glow += reached * _lobe(lean + GLOW_SHIFT, GLOW_POWER)
+    gloss[hair.skin] *= SKIN_GLOSS
     sheen = (GLOSS * gloss)[..., None] * (0.5 + 0.5 * np.sqrt(hair.colors))
     lit = hair.colors * (diffuse + 2 * GLOW * glow)[..., None] + sheen
     return np.clip(np.nan_to_num(lit), 0, 1).astype(np.float32)

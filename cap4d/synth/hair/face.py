@@ -10,8 +10,8 @@ from cap4d.synth.hair.scalp import HeadMeasures, Roots
 
 RESOLUTION = 0.00025  # m a pixel of the front view in which roots are found
 BROW_WIDTH = 0.0075  # m
-BROWS, LASHES = 420, 110  # strands on a side; of an upper lid
-LASH = 0.0048  # m
+BROWS, LASHES = 420, 80  # strands on a side; of an upper lid
+LASH = 0.0042  # m
 # An eyebrow when the rig has no landmarks: distance from the middle and height over the eyes, in halves of
 # the distance between the eyes.
 BROW_LINE = np.array([[0.42, 0.56], [0.75, 0.68], [1.15, 0.76], [1.5, 0.70], [1.78, 0.50]])
@@ -84,7 +84,7 @@ def grow_lashes(
     xy = view.low + (np.stack([chosen, upper + 4], 1) + rng.random((len(chosen), 2))) * RESOLUTION
     outer = (np.abs(xy[:, 0]) - head.half) / (0.5 * head.half)
     way = np.stack([np.sign(xy[:, 0]) * 0.7 * outer, 0.35 + 0 * outer, 1 + 0 * outer], 1)
-    return _short(view, head, xy, way + rng.normal(0, 0.12, way.shape), LASH, 0.9, points, rng)
+    return _short(view, head, xy, way + rng.normal(0, 0.06, way.shape), LASH, 0.9, points, rng)
 
 
 def _short(view, head, xy, way, length, curve, points, rng):

@@ -114,8 +114,8 @@ def strand_lengths(
 ) -> np.ndarray:
     """[K] m"""
     height, angle = head.height(roots), head.angle(roots)
-    length = style.side + (style.top - style.side) * _ramp(height, 0.3, 0.75)
-    jitter = rng.uniform(0.75, 1.05, len(roots))
+    length = style.side + (style.top - style.side) * _ramp(height, 0.0, 0.85)
+    jitter = rng.uniform(0.65, 1.05, len(roots))
     if style.cut is not None:
         over = np.linalg.norm((roots - head.centre)[:, [0, 2]], axis=1)
         around = np.maximum(0.085 - over, 0)  # from the top the way leads sideways first

@@ -223,7 +223,7 @@ def _colors(strands: np.ndarray, kind: np.ndarray, color: np.ndarray, rng: np.ra
 
 def _widths(strands: np.ndarray, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     along = np.linspace(0, 1, strands.shape[1])
-    width = HAIR_WIDTH * np.array([1.0, 0.75, 0.55])[kind] * rng.uniform(0.7, 1.3, len(strands))
+    width = HAIR_WIDTH * np.array([1.0, 0.75, 0.45])[kind] * rng.uniform(0.7, 1.3, len(strands))
     return (width[:, None] * np.interp(along, [0, 0.6, 1], [1, 1, 0.3])).astype(np.float32)
 
 

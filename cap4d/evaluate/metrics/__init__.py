@@ -1,0 +1,1 @@
+"""What pictures of an avatar are measured by, one metric a file."""

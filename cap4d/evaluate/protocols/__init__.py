@@ -1,0 +1,1 @@
+"""The paper's protocols: many fits and their evaluations, as tables and pictures."""

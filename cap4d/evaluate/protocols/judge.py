@@ -1,0 +1,32 @@
+"""How a cell's avatar is judged: by `cap4d evaluate`'s metrics, on the cell's views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from cap4d.evaluate.evaluate import evaluate
+from cap4d.evaluate.metrics.registry import METRIC_NAMES
+from cap4d.evaluate.metrics.weights import Weights
+from cap4d.evaluate.protocols.cell import Judge, Views
+
+
+def judge_by_metrics(weights: Weights, only: Sequence[str] | None = None) -> tuple[Judge, str]:
+    """A judge, and what tells it from one with other weights or metrics.
+
+    Args:
+        only: Names of metrics; None: all.
+    """
+
+    def judge(avatar: Path, capture: Path, views: Views, size: int, pictures: Path):
+        found = evaluate(
+            avatar, capture, views=views, weights=weights, only=only, size=size, pictures=pictures
+        )
+        if list(found.views) != [tuple(v) for v in views]:
+            raise AssertionError("evaluate answered for other views than it was asked for")
+        missing = {name: m.needs for name, m in found.missing.items()}
+        measured = [n for n in only or METRIC_NAMES if n not in missing]
+        return {n: found.values(n) for n in measured}, missing
+
+    sizes = {k: None if p is None else (str(p), p.stat().st_size) for k, p in vars(weights).items()}
+    return judge, repr((sizes, only))

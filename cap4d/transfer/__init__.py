@@ -1,0 +1,1 @@
+"""Avatars made elsewhere, as bundles of ours. Nothing in their files is executed."""
