@@ -6,9 +6,9 @@ import argparse
 
 from cap4d.commands.command import add_output, add_rig_option, command
 
-DEVIATIONS = """Real faces move in ways that no head model has: with --deviations 1 (the default) so do these, by a few
-millimetres where expressions meet, while the capture keeps the head model's own parameters. --deviations 0 moves
-exactly as the head model does."""
+DEVIATIONS = """Real faces move in ways that no head model has: with --deviations 1 (the default) so do these,
+by a few millimetres where expressions meet, while the capture keeps the head model's own parameters.
+--deviations 0 moves exactly as the head model does."""
 
 
 def add(commands) -> None:

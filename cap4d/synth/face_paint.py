@@ -1,4 +1,4 @@
-"""Procedural skin, lips, brows, stubble, eyes, teeth and cloth over the texels of an atlas: one person's texture.
+"""Procedural skin, lips, brows, stubble, eyes, teeth and cloth over the texels of an atlas: a person's texture.
 
 Everything is evaluated on the template in metres, with noise in space, so there are no seams. The face's
 features are found by the 68 landmarks where the rig has them, by the rig's own colours elsewhere.
@@ -261,9 +261,11 @@ def _stubble(p: np.ndarray, marks: np.ndarray | None, seed: int) -> np.ndarray:
     if marks is None:
         return np.zeros(len(p))
     jaw = _curve(marks[:17], closed=False)
-    top = np.interp(np.abs(p[:, 0]), [0, abs(marks[54, 0]), abs(marks[2, 0]), abs(marks[1, 0])],
-                    [marks[NOSE_BASE, 1] - 0.002, marks[48, 1] + 0.008, marks[2, 1] + 0.012, marks[1, 1] + 0.02])  # fmt: skip
-    bottom = np.interp(p[:, 2], jaw[:, 2][np.argsort(jaw[:, 2])], jaw[:, 1][np.argsort(jaw[:, 2])]) - 0.03
+    sides = [0, abs(marks[54, 0]), abs(marks[2, 0]), abs(marks[1, 0])]
+    heights = marks[[NOSE_BASE, 48, 2, 1], 1] + [-0.002, 0.008, 0.012, 0.02]
+    top = np.interp(np.abs(p[:, 0]), sides, heights)
+    back_to_front = jaw[np.argsort(jaw[:, 2])]
+    bottom = np.interp(p[:, 2], back_to_front[:, 2], back_to_front[:, 1]) - 0.03
     blur = 4 * MM * noise(p, 0.012, seed + 15, 2)
     inside = paint.soft_step(top - p[:, 1] + blur, -0.004, 0.006) * paint.soft_step(
         p[:, 1] - bottom + blur, 0, 0.02

@@ -1,4 +1,4 @@
-"""People who do not exist: the same from the same number, exactly where their parameters say, never half there."""
+"""People who do not exist: the same from the same number, where their parameters say, never half there."""
 
 from __future__ import annotations
 
@@ -114,9 +114,17 @@ def test_deviations_vanish_at_rest_and_leave_the_eyes_alone(builtin_rig):
 
 @pytest.mark.parametrize(
     ("wrong", "word"),
-    [({"identity": -1}, "identity"), ({"identity": 2**70}, "identity"), ({"views": 0}, "views"), ({"frames": 0}, "frames"),
-     ({"size": 0}, "size"), ({"size": 10**6}, "size"), ({"seed": -1}, "seed"), ({"deviations": float("nan")}, "deviations")],
-)  # fmt: skip
+    [
+        ({"identity": -1}, "identity"),
+        ({"identity": 2**70}, "identity"),
+        ({"views": 0}, "views"),
+        ({"frames": 0}, "frames"),
+        ({"size": 0}, "size"),
+        ({"size": 10**6}, "size"),
+        ({"seed": -1}, "seed"),
+        ({"deviations": float("nan")}, "deviations"),
+    ],
+)
 def test_refuses_numbers_out_of_range(builtin_rig, tmp_path, wrong, word):
     with pytest.raises(ArgumentError, match=word):
         synthesize(builtin_rig, tmp_path / "x", **{"identity": 1, **KIND, **wrong})
