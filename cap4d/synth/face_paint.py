@@ -1,4 +1,4 @@
-"""Procedural skin, lips, brows, stubble, eyes, teeth and cloth over the texels of an atlas: a person's texture.
+"""Procedural skin, lips, brows, stubble, eyes, teeth and cloth over the texels of an atlas: one texture.
 
 Everything is evaluated on the template in metres, with noise in space, so there are no seams. The face's
 features are found by the 68 landmarks where the rig has them, by the rig's own colours elsewhere.
