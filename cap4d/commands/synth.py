@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from cap4d.commands.command import add_output, add_rig_option, command
 
-DEVIATIONS = """Real faces move in ways that no head model has: with --deviations 1 (the default) so do these, by a few
-millimetres where expressions meet, while the capture keeps the head model's own parameters. --deviations 0 moves
-exactly as the head model does."""
+DEVIATIONS = """Real faces move in ways that no head model has: with --deviations 1 (the default) so do these,
+by a few millimetres where expressions meet, while the capture keeps the head model's own parameters.
+--deviations 0 moves exactly as the head model does."""
 
 
 def add(commands) -> None:
@@ -23,7 +22,11 @@ def add(commands) -> None:
     )
     add_rig_option(parser)
     parser.add_argument(
-        "--identity", type=int, default=1, metavar="N", help="who: the same number, the same person (default: 1)"
+        "--identity",
+        type=int,
+        default=1,
+        metavar="N",
+        help="who: the same number, the same person (default: 1)",
     )
     parser.add_argument("--views", type=int, default=16, metavar="N", help="cameras (default: 16)")
     parser.add_argument("--frames", type=int, default=100, metavar="N", help="frames of each (default: 100)")
@@ -42,7 +45,10 @@ def run_synth(arguments: argparse.Namespace) -> None:
     from cap4d.synth.capture import check_sizes, synthesize
     from cap4d.synth.folder import check_new_folder
 
-    sizes = {name: getattr(arguments, name) for name in ("identity", "views", "frames", "size", "seed", "deviations")}
+    sizes = {
+        name: getattr(arguments, name)
+        for name in ("identity", "views", "frames", "size", "seed", "deviations")
+    }
     check_sizes(**sizes)
     check_new_folder(arguments.output)
     synthesize(load_rig(arguments.rig), arguments.output, **sizes)

@@ -65,7 +65,9 @@ def _fields(rig: HeadRig, rng: np.random.Generator) -> np.ndarray:
         off = np.linalg.norm(rig.template - centre, axis=1) - radius
         skin = skin * np.clip(off / LID_ROOM - 0.5, 0, 1)
     seeds = rng.integers(2**31, size=SEVERAL)
-    return np.stack([1.5 * noise(rig.template, FIELD, int(seed), 2) * skin for seed in seeds]).astype(np.float32)
+    return np.stack([1.5 * noise(rig.template, FIELD, int(seed), 2) * skin for seed in seeds]).astype(
+        np.float32
+    )
 
 
 def _pairs(rig: HeadRig, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Procedural skin, lips, brows, stubble, eyes, teeth and cloth over the texels of an atlas: one person's texture.
+"""Procedural skin, lips, brows, stubble, eyes, teeth and cloth over the texels of an atlas: one texture.
 
 Everything is evaluated on the template in metres, with noise in space, so there are no seams. The face's
 features are found by the 68 landmarks where the rig has them, by the rig's own colours elsewhere.
@@ -134,7 +134,9 @@ def _flush(p: np.ndarray, marks: np.ndarray | None) -> np.ndarray:
     """[N] where blood shows: cheeks, nose, chin, ears."""
     if marks is None:
         return 0.3 + np.zeros(len(p))
-    cheeks = [0.55 * marks[eye].mean(0) + 0.45 * marks[corner] for eye, corner in zip(EYES, (48, 54), strict=True)]
+    cheeks = [
+        0.55 * marks[eye].mean(0) + 0.45 * marks[corner] for eye, corner in zip(EYES, (48, 54), strict=True)
+    ]
     total = sum(near(p, c + [np.sign(c[0]) * 0.012, -0.004, 0], 0.022) for c in cheeks)
     total = total + 0.9 * near(p, marks[NOSE_TIP], 0.015) + 0.4 * near(p, marks[CHIN], 0.02)
     ears = paint.soft_step(np.abs(p[:, 0]), np.abs(marks[0, 0]) - 0.001, np.abs(marks[0, 0]) + 0.012)
@@ -165,7 +167,10 @@ def _moles(p: np.ndarray, seed: int) -> np.ndarray:
 
 def _around_eyes(p: np.ndarray, rig: HeadRig) -> np.ndarray:
     return sum(
-        (np.exp(-((np.maximum(np.linalg.norm(p - c, axis=1) - r, 0) / 0.006) ** 2)) for c, r in eye_balls(rig)),
+        (
+            np.exp(-((np.maximum(np.linalg.norm(p - c, axis=1) - r, 0) / 0.006) ** 2))
+            for c, r in eye_balls(rig)
+        ),
         np.zeros(len(p)),
     )
 
@@ -191,7 +196,9 @@ def _lips(rig: HeadRig, p: np.ndarray, old: np.ndarray, marks: np.ndarray | None
     low, high = outline.min(0) - 0.004, outline.max(0) + 0.004
     box = ((p[:, :2] > low) & (p[:, :2] < high)).all(1) & (p[:, 2] > marks[48, 2] - 0.012)
     q = p[box, :2]
-    signed = paint.distance_to_line(q, outline, closed=True) * np.where(paint.inside_polygon(q, outline), 1, -1)
+    signed = paint.distance_to_line(q, outline, closed=True) * np.where(
+        paint.inside_polygon(q, outline), 1, -1
+    )
     lips = np.zeros(len(p))
     lips[box] = paint.soft_step(signed, -0.9 * MM, 0.9 * MM)
     return lips
@@ -228,7 +235,9 @@ def _brow(p: np.ndarray, line: np.ndarray, seed: int) -> np.ndarray:
     q = np.column_stack([(p[:, :2] * run).sum(1) * 0.16, (p[:, :2] * side).sum(1), np.zeros(len(p))])
     hairs = noise(q, 0.62 * MM, seed + 14, 2)
     density = 1 - paint.soft_step(edge, 0.45, 1.15)
-    return np.clip(density * 1.5 * (0.62 + 0.85 * hairs), 0, 1) * (0.55 + 0.45 * paint.soft_step(along, 0, 0.2))
+    return np.clip(density * 1.5 * (0.62 + 0.85 * hairs), 0, 1) * (
+        0.55 + 0.45 * paint.soft_step(along, 0, 0.2)
+    )
 
 
 def _lash_line(rig: HeadRig, p: np.ndarray, marks: np.ndarray | None) -> np.ndarray:
@@ -252,11 +261,15 @@ def _stubble(p: np.ndarray, marks: np.ndarray | None, seed: int) -> np.ndarray:
     if marks is None:
         return np.zeros(len(p))
     jaw = _curve(marks[:17], closed=False)
-    top = np.interp(np.abs(p[:, 0]), [0, abs(marks[54, 0]), abs(marks[2, 0]), abs(marks[1, 0])],
-                    [marks[NOSE_BASE, 1] - 0.002, marks[48, 1] + 0.008, marks[2, 1] + 0.012, marks[1, 1] + 0.02])  # fmt: skip
-    bottom = np.interp(p[:, 2], jaw[:, 2][np.argsort(jaw[:, 2])], jaw[:, 1][np.argsort(jaw[:, 2])]) - 0.03
+    sides = [0, abs(marks[54, 0]), abs(marks[2, 0]), abs(marks[1, 0])]
+    heights = marks[[NOSE_BASE, 48, 2, 1], 1] + [-0.002, 0.008, 0.012, 0.02]
+    top = np.interp(np.abs(p[:, 0]), sides, heights)
+    back_to_front = jaw[np.argsort(jaw[:, 2])]
+    bottom = np.interp(p[:, 2], back_to_front[:, 2], back_to_front[:, 1]) - 0.03
     blur = 4 * MM * noise(p, 0.012, seed + 15, 2)
-    inside = paint.soft_step(top - p[:, 1] + blur, -0.004, 0.006) * paint.soft_step(p[:, 1] - bottom + blur, 0, 0.02)
+    inside = paint.soft_step(top - p[:, 1] + blur, -0.004, 0.006) * paint.soft_step(
+        p[:, 1] - bottom + blur, 0, 0.02
+    )
     front = paint.soft_step(p[:, 2], marks[0, 2] - 0.004, marks[0, 2] + 0.008)
     distance, own = spots(p, 0.75 * MM, seed + 16)
     dots = 1 - paint.soft_step(distance, 0.12 * MM, (0.30 + 0.25 * own) * MM)

@@ -33,7 +33,7 @@ class Lights:
 
 @dataclass(frozen=True, eq=False)
 class Occlusion:
-    """How much each of V vertices sees: `open` float32[V] of the sky, `visible` float32[V, L] of the lights."""
+    """How much each of V vertices sees: `open` float32[V] of the sky, `visible` float32[V, L] of lights."""
 
     open: np.ndarray
     visible: np.ndarray

@@ -73,13 +73,13 @@ class Pose:
 
 def draw_person(rig: HeadRig, identity: int, *, texels: int = 1024) -> Person:
     """The person with this number: the same on any machine, for any size of texture."""
+    atlas = build_atlas(rig, texels)
     body, looks, light = (np.random.default_rng([identity, part]) for part in range(3))
     shape = np.clip(body.normal(0, IDENTITY_SPREAD, rig.n_identity), -IDENTITY_LIMIT, IDENTITY_LIMIT)
     shape = shape.astype(np.float32)
     subject, lights = rig.subject(shape), draw_lights(light)
     hair = grow_hair(rig, subject.neutral, seed=identity)
     look = draw_complexion(looks, linear(np.asarray(hair.color, np.float64)))
-    atlas = build_atlas(rig, texels)
     return Person(
         rig=rig,
         shape=shape,
@@ -193,7 +193,9 @@ def _neighbours(faces: np.ndarray, count: int):
 
     rows, columns = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
     ends = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
-    links = csr_matrix((np.ones(2 * len(rows), np.float32), ends), (count, count)) + identity(count, np.float32)
+    links = csr_matrix((np.ones(2 * len(rows), np.float32), ends), (count, count)) + identity(
+        count, np.float32
+    )
     return (diags(1 / np.asarray(links.sum(1)).ravel()) @ links).astype(np.float32).tocsr()
 
 

@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 DISTANCE, FOV_DEG = 1.1, 19.0  # m and degrees of every camera
 TARGET = np.array([0.0, -0.002, 0.006])  # m, head-fixed, OpenCV axes: what the cameras look at
 YAW_DEG, PITCH_DEG = 64.0, (-17.0, 2.0, 20.0)  # outermost cameras, and the rows they stand in
+TEXELS_PER_PIXEL, TEXELS = 4, (256, 2048)  # of the texture: a side per side of the image, and its limits
 PERSON = "person.json"
 
 
@@ -54,7 +55,7 @@ def film(
         ArgumentError: A number out of range, no UVs, or no new folder can be made there.
     """
     check_new_folder(Path(output))
-    person = draw_person(rig, identity, texels=1024 if size <= 256 else 2048)
+    person = draw_person(rig, identity, texels=int(np.clip(TEXELS_PER_PIXEL * size, *TEXELS)))
     body = draw_body(rig, person.subject, np.random.default_rng([identity, 3]), deviations)
     cameras = ring_of_cameras(views, size, np.random.default_rng(seed))
     performance = perform(rig, frames, np.random.default_rng([seed, identity]))
@@ -64,7 +65,10 @@ def film(
         save_performance(rig, folder, person.shape, cameras, performance, valid)
         _write_person(folder, rig, identity, seed, deviations)
         for t in progress(range(frames), f"{output}: frames of {views} views", frames):
-            expr, turns = performance.expr[t], {n: getattr(performance, n)[t] for n in ("eye_rot", "neck_rot")}
+            expr, turns = (
+                performance.expr[t],
+                {n: getattr(performance, n)[t] for n in ("eye_rot", "neck_rot")},
+            )
             vertices = opencv_from_rig(body.pose(expr, **turns).astype(np.float64))
             _shoot(folder, person, pose_person(person, vertices), cameras, performance, t)
     log.info("%s: %d images in %.0f s", output, views * frames, time.monotonic() - start)

@@ -1,4 +1,4 @@
-"""People who do not exist: the same from the same number, exactly where their parameters say, never half there."""
+"""People who do not exist: the same from the same number, where their parameters say, never half there."""
 
 from __future__ import annotations
 
@@ -98,7 +98,10 @@ def test_depth_is_along_the_cameras_axis(person):
 
 def test_deviations_vanish_at_rest_and_leave_the_eyes_alone(builtin_rig):
     subject = builtin_rig.subject()
-    rest, expr = np.zeros(builtin_rig.n_expressions, np.float32), np.full(builtin_rig.n_expressions, 0.4, np.float32)
+    rest, expr = (
+        np.zeros(builtin_rig.n_expressions, np.float32),
+        np.full(builtin_rig.n_expressions, 0.4, np.float32),
+    )
     turns = {"eye_rot": np.float32([0.1, 0.1, 0]), "neck_rot": np.float32([0, 0.1, 0])}
     own = draw_body(builtin_rig, subject, np.random.default_rng(1), 1.0)
     exact = draw_body(builtin_rig, subject, np.random.default_rng(1), 0.0)
@@ -111,9 +114,17 @@ def test_deviations_vanish_at_rest_and_leave_the_eyes_alone(builtin_rig):
 
 @pytest.mark.parametrize(
     ("wrong", "word"),
-    [({"identity": -1}, "identity"), ({"identity": 2**70}, "identity"), ({"views": 0}, "views"), ({"frames": 0}, "frames"),
-     ({"size": 0}, "size"), ({"size": 10**6}, "size"), ({"seed": -1}, "seed"), ({"deviations": float("nan")}, "deviations")],
-)  # fmt: skip
+    [
+        ({"identity": -1}, "identity"),
+        ({"identity": 2**70}, "identity"),
+        ({"views": 0}, "views"),
+        ({"frames": 0}, "frames"),
+        ({"size": 0}, "size"),
+        ({"size": 10**6}, "size"),
+        ({"seed": -1}, "seed"),
+        ({"deviations": float("nan")}, "deviations"),
+    ],
+)
 def test_refuses_numbers_out_of_range(builtin_rig, tmp_path, wrong, word):
     with pytest.raises(ArgumentError, match=word):
         synthesize(builtin_rig, tmp_path / "x", **{"identity": 1, **KIND, **wrong})
@@ -159,7 +170,7 @@ def test_noise_is_bounded_smooth_and_seeded():
     assert np.abs(_core.gradient_noise(points + np.float32(1e-3), 7) - value).max() < 0.02
     assert np.abs(_core.gradient_noise(points, 8) - value).max() > 0.5
     distance, own = _core.cellular_noise(points, 7)
-    assert 0 <= distance.min() and distance.max() < 1.8 and 0 <= own.min() and own.max() < 1
+    assert distance.min() >= 0 and distance.max() < 1.8 and own.min() >= 0 and own.max() < 1
     assert _core.gradient_noise(np.float32([[np.inf, np.nan, 1e30]]), 1).shape == (1,)
 
 
@@ -172,7 +183,9 @@ def test_light_surface_refuses_what_it_would_read_beyond(person, name, monkeypat
         arrays = {"face": face, "faces": faces, "uv_faces": uv_faces, "uvs": rest[6]}
         arrays[name] = np.array(arrays[name])
         arrays[name].ravel()[0] = np.nan if name == "uvs" else 10**9
-        return true(arrays["face"], bary, arrays["faces"], arrays["uv_faces"], *rest[:6], arrays["uvs"], *rest[7:])
+        return true(
+            arrays["face"], bary, arrays["faces"], arrays["uv_faces"], *rest[:6], arrays["uvs"], *rest[7:]
+        )
 
     monkeypatch.setattr(_core, "light_surface", spoiled)
     with pytest.raises(ValueError, match=name):
