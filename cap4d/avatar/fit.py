@@ -22,7 +22,7 @@ from cap4d.avatar.losses import Distance, Perceptual, gradient_distance
 from cap4d.avatar.model import create_avatar
 from cap4d.avatar.paint import paint
 from cap4d.avatar.presets import Preset, preset_named
-from cap4d.avatar.references import Selection, select, split_selected
+from cap4d.avatar.references import Selection, select, split_selected, suited
 from cap4d.avatar.report import FitReport, compare, summarise, write_sheet
 from cap4d.avatar.trainer import Trainer
 from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, split_views, spread
@@ -90,6 +90,7 @@ def fit(
         check_rig(capture, rig)
     selection = select(loaded[0], references, hold_out)
     split = split_captures(loaded, selection, settings.image_size)
+    settings = suited(settings, len(split.train))
     trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed, perceptual=perceptual)
     checkpoint = output.with_suffix(".fit.ckpt")
     data = fingerprint(captures, settings, selection)
