@@ -60,7 +60,7 @@ def fit(
             camera.
         rig: The head rig of the captures.
         output: `.cap4d` file to write.
-        preset: Name of a preset, or one.
+        preset: Name of a preset, or one; a fit to few images adapts the short recipe's (`suited`).
         resume: Go on from the checkpoint of an interrupted fit, if there is one.
         ablate: `unet` leaves the deformation network out; `remesh` the UV grid too: the Gaussians ride on the
             rig's own triangles (`own_triangles`), as in GaussianAvatars; `lpips` the perceptual term; `mmdm`
