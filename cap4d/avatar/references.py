@@ -126,11 +126,11 @@ def suited(preset: Preset, count: int) -> Preset:
     Adam takes full steps along any gradient that keeps its sign, however small. With few images that of a
     Gaussian which shines through others does: it takes on whatever colour mends the last digit of these
     images, and shows it where it is seen from elsewhere. A larger eps leaves it almost alone: steps go with
-    the gradient where that is below eps.
+    the gradient where that is below eps. Ten images settle it themselves (1e-7 for 1e-8 costs them 0.1 dB).
     """
     if preset.recipe != "short":
         return preset
-    eps = max(preset.rates.gaussian_eps, FEW_EPS / count**2)
+    eps = max(preset.rates.gaussian_eps, FEW_EPS / count**3)
     return replace(preset, rates=replace(preset.rates, gaussian_eps=eps))
 
 
