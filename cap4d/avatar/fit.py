@@ -25,7 +25,7 @@ from cap4d.avatar.model import create_avatar
 from cap4d.avatar.paint import paint
 from cap4d.avatar.pause import pausing
 from cap4d.avatar.presets import Preset, preset_named
-from cap4d.avatar.references import Selection, select, split_selected
+from cap4d.avatar.references import Selection, select, split_selected, suited
 from cap4d.avatar.report import FitReport, compare, peak_memory_mb, summarise, write_sheet
 from cap4d.avatar.trainer import Trainer
 from cap4d.avatar.views import FitView, Split, check_rig, is_video, load_views, split_views, spread
@@ -77,7 +77,7 @@ def fit(
             camera.
         rig: The head rig of the captures.
         output: `.cap4d` file to write.
-        preset: Name of a preset, or one.
+        preset: Name of a preset, or one; a fit to few images adapts the short recipe's (`suited`).
         resume: Go on from the checkpoint of an interrupted fit, if there is one.
         ablate: `unet` leaves the deformation network out; `remesh` the UV grid too: the Gaussians ride on the
             rig's own triangles (`own_triangles`), as in GaussianAvatars; `lpips` the perceptual term; `mmdm`
@@ -109,6 +109,7 @@ def fit(
         check_rig(capture, rig)
     selection = select(loaded[0], references, hold_out)
     split = split_captures(loaded, selection, settings.image_size)
+    settings = suited(settings, len(split.train))
     trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed, perceptual=perceptual)
     checkpoint = output.with_suffix(".fit.ckpt")
     data = fingerprint(captures, settings, selection)

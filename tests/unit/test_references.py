@@ -1,17 +1,20 @@
 """Which images a fit is given: chosen, nested, never of a held-out camera."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from tiny_avatar import tiny_rig
 
+from cap4d.avatar.presets import preset_named
 from cap4d.avatar.references import (
     choose_held_out,
     choose_references,
     read_references,
     select,
     split_selected,
+    suited,
 )
 from cap4d.camera import Camera, look_at
 from cap4d.capture.capture import Capture, save_capture
@@ -133,6 +136,14 @@ def test_generated_captures_are_split_as_usual(ring, tmp_path):
 def test_a_wrong_selection_is_refused(ring, references, hold_out, found):
     with pytest.raises(ArgumentError, match=found):
         select(ring, references, hold_out)
+
+
+def test_few_images_hold_hidden_gaussians_still():
+    short, released = (preset_named("low", recipe) for recipe in ("short", "released"))
+    eps = [suited(short, count).rates.gaussian_eps for count in (1, 2, 10, 1000)]
+    assert eps == pytest.approx([1e-5, 1.25e-6, 1e-8, 1e-8])
+    assert replace(suited(short, 1), rates=short.rates) == short
+    assert suited(released, 1) == released
 
 
 def test_references_are_read_from_a_file(ring, tmp_path):
