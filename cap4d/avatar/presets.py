@@ -15,8 +15,10 @@
 | split offset (fact 30) | world units | local units | local units |
 | opacity resets | with the first growth, every 20k | same | none |
 | L1 : 1 - SSIM | 0.6 : 0.4 | 0.8 : 0.2, GaussianAvatars' (no value given) | 0.6 : 0.4 |
+| squared error | none | none | 5 |
 | LPIPS | 0.1 x, share 0 to 0.9 | 1 x, share 0 to 0.9 (no factor given) | none |
 | matte term | none | none | 0.1 |
+| local means beyond the limit (face sizes) | 1e-3 (2.0) | same | 1e-2 (0.7) |
 | Laplacian of the deformation | 1.0 | none | 1.0 |
 | corrections | neck offsets, penalty 1.0 | none | of all tracked (one camera), or none |
 | Adam's eps: Gaussians; necks | 1e-15; 1e-18 | same | 1e-8; 1e-15 |
@@ -156,6 +158,12 @@ class Preset:
 @dataclass(frozen=True)
 class Choices:
     """What may be chosen apart from preset and recipe; None leaves it to them.
+
+    Measured on a synthetic ICT capture (288 training images of 128 px, 32 held out, 200 steps, one seed),
+    held out: pruning by contribution 30.01 -> 30.16 dB at 40,000 Gaussians, in 16 s instead of 14; a floor of
+    0, 1 and 2 where 8,000 Gaussians were asked for: 28.88, 30.09, 31.11 dB with 12,000, 26,126 and 51,942;
+    where most growth is splitting, offsets in local units 29.47 dB, in world units 29.88 dB: in a fit
+    so short, children that start where the parent was are the better ones.
 
     Args:
         perceptual: `none`, `lpips`, or `gradient`, the stand-in without weights.
@@ -307,7 +315,9 @@ SHORT_RATES = LearningRates(
 
 # A camera that sees a head turn by a few degrees says little about depth: Gaussians stay near the surface,
 # so that hair does not swim where the head goes on to turn (+0.1 dB on frames beyond the last trained one).
-NEAR_SURFACE = LossWeights(position=1e-2, position_limit=0.7)
+# A short fit has far to go, and squared errors show it where to begin: on a talking head's held-out frames,
+# 800 steps, 28.66 -> 29.04 dB and SSIM 0.922 -> 0.925.
+SHORT_WEIGHTS = LossWeights(l2=5.0, position=1e-2, position_limit=0.7)
 
 PRESETS = {
     "default": Preset(
@@ -322,7 +332,7 @@ PRESETS = {
         expression_noise=0.1,
         densify=Densify(start=800, stop=7_200, every=200, most=180_000, split_scale=0.003),
         rates=SHORT_RATES,
-        weights=NEAR_SURFACE,
+        weights=SHORT_WEIGHTS,
     ),
     "medium": Preset(
         name="medium",
@@ -336,7 +346,7 @@ PRESETS = {
         expression_noise=0.1,
         densify=Densify(start=400, stop=3_600, every=100, most=120_000, split_scale=0.003),
         rates=SHORT_RATES,
-        weights=NEAR_SURFACE,
+        weights=SHORT_WEIGHTS,
     ),
     "low": Preset(
         name="low",
@@ -350,7 +360,7 @@ PRESETS = {
         expression_noise=0.1,
         densify=Densify(start=200, stop=1_800, every=100, most=90_000, split_scale=0.003),
         rates=SHORT_RATES,
-        weights=NEAR_SURFACE,
+        weights=SHORT_WEIGHTS,
     ),
     "debug": Preset(
         name="debug",
@@ -363,7 +373,7 @@ PRESETS = {
         sh_every=1000,
         densify=Densify(start=100, stop=400, every=50, most=50_000, split_scale=0.003),
         rates=SHORT_RATES,
-        weights=NEAR_SURFACE,
+        weights=SHORT_WEIGHTS,
     ),
 }
 RECIPES = {"released": RELEASED, "paper": PAPER, "short": PRESETS}
