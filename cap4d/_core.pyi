@@ -23,7 +23,7 @@ def gradient_noise(points: _F32, seed: int) -> _F32:
     """points [N, 3] in units of the lattice -> Perlin's noise [N] in about [-1, 1]."""
 
 def cellular_noise(points: _F32, seed: int) -> tuple[_F32, _F32]:
-    """points [N, 3] in units of a cell -> distance [N] to the nearest feature, and a number [N] of its own."""
+    """points [N, 3] in units of a cell -> distance [N] to the nearest feature, and its own number [N]."""
 
 def light_surface(
     face: _I32,

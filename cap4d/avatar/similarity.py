@@ -1,4 +1,4 @@
-"""How alike two images are, in one pass of C++: mean absolute difference and SSIM, with gradients."""
+"""Two images in one pass of C++: mean absolute difference and SSIM, with gradients."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def test_tensors_that_do_not_fit_are_refused():
     offsets = np.zeros((1, 3, 16, 16), np.float32)
     with pytest.raises(ValueError, match="offsets"):
         run.forward(offsets[:, :2].copy(), down, up)
-    with pytest.raises(ValueError, match="down 0.weight"):
+    with pytest.raises(ValueError, match=r"down 0\.weight"):
         run.forward(offsets, [down[1], *down[1:]], up)
     with pytest.raises(ValueError, match="up layers: expected 3"):
         run.forward(offsets, down, up[:-1])
