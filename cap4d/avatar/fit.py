@@ -69,6 +69,7 @@ def fit(
     references: Sequence[tuple[str, int]] | None = None,
     hold_out: Sequence[str] = (),
     device: str = "auto",
+    tiers: bool = True,
 ) -> FitReport:
     """Fits an avatar and writes it, its report and its picture.
 
@@ -88,6 +89,7 @@ def fit(
             held out.
         hold_out: Cameras of the first capture that are never trained on.
         device: `auto`, `cpu` or `cuda` (see `device_named`).
+        tiers: Also make the cheaper deformers for small machines (see `export_bundle`).
     Raises:
         ArgumentError: An unknown preset or ablation, or no frame to train on.
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
@@ -133,7 +135,16 @@ def fit(
     pace = run(trainer, save)
     trainer.move(torch.device("cpu"))
     report = finish(
-        trainer, loaded, split, rig, output, ablate=ablate, seconds=seconds, pace=pace, device=place
+        trainer,
+        loaded,
+        split,
+        rig,
+        output,
+        ablate=ablate,
+        seconds=seconds,
+        pace=pace,
+        device=place,
+        tiers=tiers,
     )
     remove_checkpoints(checkpoint)
     return report
@@ -258,13 +269,15 @@ def progress(trainer: Trainer, loss: float, pace: float) -> str:
     )
 
 
-def finish(trainer, captures, split, rig, output: Path, *, ablate, seconds, pace, device) -> FitReport:
+def finish(
+    trainer, captures, split, rig, output: Path, *, ablate, seconds, pace, device, tiers=True
+) -> FitReport:
     """Compares with the held-out frames and writes avatar, numbers and picture."""
     from cap4d.export.bundle import export_bundle
 
     comparison = compare(trainer, split) if split.held_out else None
     clip = trainer.corrections[0].corrected(captures[0].clip())
-    export_bundle(trainer.model, output, rig=rig, capture=captures[0], clip=clip)
+    export_bundle(trainer.model, output, rig=rig, capture=captures[0], clip=clip, tiers=tiers)
     if comparison is not None:
         write_sheet(comparison, output.with_suffix(".fit.png"))
     times = {"seconds": seconds(), "step_ms": 1e3 * pace}

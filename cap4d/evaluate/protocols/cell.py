@@ -118,7 +118,10 @@ def run_cell(cell: Cell, rig: Path, folder: Path, judge: Judge, judged_by: str) 
 
 
 def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
-    """Fits the avatar; goes on where an interrupted fit of the same cell stopped."""
+    """Fits the avatar; goes on where an interrupted fit of the same cell stopped.
+
+    Without the cheaper deformers: an avatar is judged by its exact one.
+    """
     from cap4d.avatar.fit import fit
     from cap4d.rig.store import load_rig
 
@@ -133,6 +136,7 @@ def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
         lpips_weights=cell.lpips_weights,
         references=cell.references,
         hold_out=cell.hold_out,
+        tiers=False,
     )
 
 
