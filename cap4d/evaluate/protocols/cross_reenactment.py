@@ -36,14 +36,14 @@ from cap4d.evaluate.pair import Pair
 from cap4d.evaluate.protocols.cell import DIGITS, add_files, files_of, read_verdict, write_verdict
 from cap4d.evaluate.protocols.cells import Failure, check_whole, run_cells
 from cap4d.evaluate.protocols.layout import table
-from cap4d.evaluate.protocols.page import write_truth
-from cap4d.evaluate.protocols.titled_sheet import draw_sheet
+from cap4d.evaluate.protocols.page import Strip, draw_page, write_truth
 from cap4d.player.avatar import Avatar
 
 TRANSFER = ("AED", "APD", "AED-mp", "APD-mp", "gaze", "blink")
 """Metrics of what a face does, whoever's it is."""
 IDENTITY = "CSIM"
-SHOWN = 4  # frames on the page
+SHOWN = 4  # frames of a driver on the page
+DRIVER = "driver"
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -90,7 +90,7 @@ def cross_reenactment(
     Args:
         avatars: `.cap4d` files.
         drivers: Captures of other people, of the avatars' rig.
-        output: Folder for report.json, table.md, page.png and the cells; made if need be.
+        output: Folder for report.json, table.md, page.html, page.png and the cells; made if need be.
     Raises:
         ArgumentError: Names that cannot be told apart, or none.
         DataError: A cell failed: the others are there.
@@ -239,7 +239,7 @@ def markdown(results: Sequence[Driven], failures: Sequence[Failure]) -> list[str
 
 def _draw(output: Path, results: Sequence[Driven], drivers: dict[str, Path], size: int) -> None:
     avatars = list(dict.fromkeys(r.avatar for r in results))
-    rows = []
+    strips = []
     for name in dict.fromkeys(r.driver for r in results):
         own = [r for r in results if r.driver == name]
         capture = Capture.load(drivers[name])
@@ -248,8 +248,8 @@ def _draw(output: Path, results: Sequence[Driven], drivers: dict[str, Path], siz
             file = output / "truth" / name / f"{view[0]}_{view[1]:05d}.png"
             write_truth(capture, view, size, file)
             pictures = {r.avatar: r.picture(view) for r in own}
-            rows.append((f"{name}, frame {view[1]}", {"driver": file, **pictures}))
-    draw_sheet(output / "page.png", ["driver", *avatars], rows)
+            strips.append(Strip(f"{name}, frame {view[1]}", {DRIVER: file, **pictures}))
+    draw_page(output, [DRIVER, *avatars], strips)
 
 
 def _names(kind: str, *choices: list[str]) -> list[str]:
