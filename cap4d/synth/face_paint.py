@@ -104,7 +104,7 @@ def _skin(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> P
     lash = _lash_line(rig, p, marks)
     albedo += (0.75 * lash)[:, None] * (look.hair * 0.5 + 0.01 - albedo)
     hair = np.clip(atlas.of_vertices(look.scalp, texels), 0, 1)
-    hair = paint.soft_step(hair + 0.35 * noise(p, 2.5 * MM, seed + 18, 2), 0.25, 0.85)
+    hair = paint.soft_step(hair + 0.15 * noise(p, 2.5 * MM, seed + 18, 2), 0.25, 0.85)
     strands = 1 + 0.5 * noise(p * [1, 0.35, 0.35], 1.2 * MM, seed + 9, 2)
     albedo += (0.92 * hair)[:, None] * (look.hair * strands[:, None] + 0.03 * albedo - albedo)
     height += hair * 0.25 * MM * noise(p, 1.5 * MM, seed + 10, 2)
