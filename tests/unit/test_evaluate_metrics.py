@@ -497,9 +497,17 @@ def test_lpips_without_weights_says_what_it_needs(tmp_path, monkeypatch):
 # JOD
 
 
-def test_jod_falls_with_harm_and_a_video_is_taken_in_order():
-    for module in ("pyfvvdp", "ffmpeg", "past", "imageio", "torch"):
-        pytest.importorskip(module, reason="needs the extra [jod]")
+@pytest.fixture
+def fvvdp():
+    for module in ("torch", "pyfvvdp", "ffmpeg", "past", "imageio"):
+        pytest.importorskip(
+            module,
+            reason="needs FovVideoVDP, for non-commercial use only and so never installed by itself: "
+            "pip install 'cap4d[jod]', then pip install --no-deps pyfvvdp",
+        )
+
+
+def test_jod_falls_with_harm_and_a_video_is_taken_in_order(fvvdp):
     from cap4d.evaluate.metrics.jod import JustObjectionableDifference
 
     metric, image = JustObjectionableDifference(), soft_noise(96)
@@ -517,9 +525,7 @@ def test_jod_falls_with_harm_and_a_video_is_taken_in_order():
     assert taken == [0, 1, 2, 3]
 
 
-def test_jod_is_what_fovvideovdp_says_of_whole_arrays():
-    for module in ("pyfvvdp", "ffmpeg", "past", "imageio", "torch"):
-        pytest.importorskip(module, reason="needs the extra [jod]")
+def test_jod_is_what_fovvideovdp_says_of_whole_arrays(fvvdp):
     from cap4d.evaluate.metrics.jod import JustObjectionableDifference
 
     metric = JustObjectionableDifference()

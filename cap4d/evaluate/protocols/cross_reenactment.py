@@ -92,9 +92,10 @@ def cross_reenactment(
         drivers: Captures of other people, of the avatars' rig.
         output: Folder for report.json, table.md, page.html, page.png and the cells; made if need be.
     Raises:
-        ArgumentError: Names that cannot be told apart, or none.
-        DataError: A cell failed: the others are there.
+        ArgumentError: Names that cannot be told apart, or none; a file of the weights that is not there.
+        DataError: A cell failed: the others are there; a file of the weights is no such network.
     """
+    metrics_available(cross.weights, only=(IDENTITY, "AED", "APD"))
     names = _names("avatars", [a.stem for a in avatars], [a.resolve().parent.name for a in avatars])
     people = _names("drivers", [d.resolve().name for d in drivers])
     jobs = [
