@@ -164,6 +164,9 @@ def test_a_cell_that_fails_does_not_lose_the_others(data, tmp_path, monkeypatch)
         ({"references": (0,)}, "references"),
         ({"references": (100,)}, "references: expected 1 to 12, got 100"),
         ({"hold_out": 9}, "hold_out_cameras"),
+        ({"size": 0}, "size: expected 16 to"),
+        ({"frames": 0}, "frames: expected at least 1"),
+        ({"reference_seed": -1}, "reference_seed: expected"),
         ({"hold_out": ("nobody",)}, "nobody"),
     ],
 )

@@ -33,7 +33,7 @@ from cap4d.evaluate.metrics.metric import NotMeasured
 from cap4d.evaluate.metrics.registry import metrics_available
 from cap4d.evaluate.metrics.weights import Weights
 from cap4d.evaluate.pair import Pair
-from cap4d.evaluate.protocols.cell import DIGITS, add_files, files_of, read_verdict, write_verdict
+from cap4d.evaluate.protocols.cell import DIGITS, Judged, add_files, files_of, read_verdict, write_verdict
 from cap4d.evaluate.protocols.cells import Failure, check_whole, run_cells
 from cap4d.evaluate.protocols.layout import table
 from cap4d.evaluate.protocols.page import Strip, draw_page, write_truth
@@ -63,23 +63,12 @@ class Cross:
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
-    """An avatar driven by somebody: numbers per frame (NaN: no face there), what is missing, pictures."""
+class Driven(Judged):
+    """An avatar driven by somebody."""
 
     avatar: str
     driver: str
     views: tuple[tuple[str, int], ...]
-    values: dict[str, np.ndarray]
-    missing: dict[str, str]
-    folder: Path
-
-    def mean(self, metric: str) -> float | None:
-        values = self.values.get(metric, np.zeros(0))
-        values = values[np.isfinite(values)]
-        return float(values.mean()) if len(values) else None
-
-    def picture(self, view: tuple[str, int]) -> Path:
-        return self.folder / "pictures" / view[0] / f"{view[1]:05d}.png"
 
 
 def cross_reenactment(
@@ -125,7 +114,7 @@ def drive(avatar: Path, driver: Path, output: Path, cross: Cross, *, names: tupl
         values, missing = measure(avatar, driver, views, cross, folder / "pictures")
         write_verdict(verdict, " by ".join(names), views, values, missing)
     values, missing = read_verdict(verdict, len(views))
-    return Driven(*names, views, values, missing, folder)
+    return Driven(folder, values, missing, *names, views)
 
 
 def driven_views(capture: Capture, frames: int) -> tuple[tuple[str, int], ...]:
