@@ -31,6 +31,7 @@ split offset can be chosen apart from the recipe, see `Choices`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -88,6 +89,8 @@ class Densify:
         prune_radius, prune_scale: Too large, px on a screen and m.
         reset_every: Period of lowering all opacities to at most 0.01, which also happens at `start`; 0:
             never.
+        bounds: Whether Gaussians grow at `start` and `stop` themselves, and resets may fall on `stop`
+            (`closed`), or not (`open`, as in the released code). Not in the repr, see `LossWeights`.
     """
 
     start: int
@@ -103,10 +106,18 @@ class Densify:
     prune_radius: float = 20.0
     prune_scale: float = 0.1
     reset_every: int = 0
+    bounds: Literal["closed", "open"] = field(default="closed", repr=False)
+
+    def grows_at(self, step: int) -> bool:
+        """Whether there is a round of growth after this step."""
+        if step % self.every or not self.start <= step <= self.stop:
+            return False
+        return self.bounds == "closed" or step not in (self.start, self.stop)
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are lowered after this step (fact 37)."""
-        if not self.reset_every or step > self.stop:
+        last = self.stop if self.bounds == "closed" else self.stop - 1
+        if not self.reset_every or step > last:
             return False
         return step == self.start or step % self.reset_every == 0
 
@@ -220,7 +231,11 @@ def _released(
     reset_every: int,
     lpips: tuple[int, int],
 ) -> Preset:
-    """A row of fact 37's table; all the rest is common to its rows."""
+    """A row of fact 37's table; all the rest is common to its rows.
+
+    Its limit of 20 px on a Gaussian's radius is not among them: the released code forgets the radii before it
+    compares them.
+    """
     start, stop, every = densify
     return Preset(
         name=name,
@@ -239,9 +254,11 @@ def _released(
             most=None,
             split_offset="world",
             prune_big_after=reset_every,
+            prune_radius=math.inf,
             reset_every=reset_every,
+            bounds="open",
         ),
-        weights=LossWeights(matte=0.0),
+        weights=LossWeights(matte=0.0, measures="released"),
         perceptual=Perceptual.of("lpips", *lpips),
         corrections="neck",
         rotation_every=1,

@@ -6,7 +6,7 @@ All randomness is a function of the seed and the step, so a resumed fit repeats 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch import nn
 from cap4d.avatar.densify import Evidence, Rows, densify, reset_opacity
 from cap4d.avatar.losses import (
     Distance,
+    axis_position_loss,
     laplacian_loss,
     photometric,
     position_loss,
@@ -24,7 +25,7 @@ from cap4d.avatar.losses import (
     relative_rotation_loss,
     scale_loss,
 )
-from cap4d.avatar.model import AvatarModel, Posed
+from cap4d.avatar.model import AvatarModel, Deformation, Posed
 from cap4d.avatar.presets import Preset
 from cap4d.avatar.views import FitView, spread
 from cap4d.avatar.worth import removal_errors
@@ -143,19 +144,27 @@ class Trainer:
         loss = self._photometric(rendered.rgb, view.target)
         if view.coverage is not None and w.matte > 0:
             loss = loss + w.matte * (rendered.alpha - view.coverage.float()).abs().mean()
-        loss = loss + w.position * position_loss(local["means"], visible, w.position_limit)
+        stray = position_loss if w.measures == "released" else axis_position_loss
+        loss = loss + w.position * stray(local["means"], visible, w.position_limit)
         loss = loss + w.scale * scale_loss(local["log_scales"], visible, w.scale_limit)
         loss = loss + w.pose * self.corrections[view.capture].penalty(view.frame)
-        d = posed.deformation
-        if d is None:
-            return loss
-        loss = loss + w.laplacian * laplacian_loss(d.maps)
-        loss = loss + w.deformation * relative_deformation_loss(d.moved, d.neutral)
-        every = self.preset.rotation_every
-        if self.step % every:
-            return loss
-        turning = rotation_term(posed.surface, d.moved, d.neutral, self.faces)
-        return loss + every * w.rotation * turning
+        if posed.deformation is not None:
+            for term in self._deformation_terms(posed.surface, posed.deformation):
+                loss = loss + term
+        return loss
+
+    def _deformation_terms(self, surface: torch.Tensor, d: Deformation) -> Iterator[torch.Tensor]:
+        """What the network pays in this step (fact 35)."""
+        w, every = self.preset.weights, self.preset.rotation_every
+        if w.measures == "released":
+            yield w.laplacian * laplacian_loss(self.model.moving_map(d)[None])
+            riders = (self.model.riding(surface + x)[0] for x in (d.moved, d.neutral))
+            yield w.deformation * relative_deformation_loss(*riders)
+        else:
+            yield w.laplacian * laplacian_loss(d.maps)
+            yield w.deformation * relative_deformation_loss(d.moved, d.neutral)
+        if self.step % every == 0:
+            yield every * w.rotation * rotation_term(surface, d.moved, d.neutral, self.faces)
 
     def _photometric(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """The mixture of L1 and SSIM, less and less of it as the perceptual distance comes in (fact 33)."""
@@ -167,7 +176,7 @@ class Trainer:
 
     def _refine(self) -> None:
         d = self.preset.densify
-        if d.start <= self.step <= d.stop and self.step % d.every == 0:
+        if d.grows_at(self.step):
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
             densify(
                 self.rows,
