@@ -169,7 +169,7 @@ class AvatarModel(nn.Module):
         return bind_to(vertices, self.faces, **local, binding=self.binding)
 
     def moving_map(self, deformation: Deformation) -> torch.Tensor:
-        """[3, S, S] m: the expression's map where the surface may move, the neutral one elsewhere (fact 24)."""
+        """[3, S, S] m: the map of the expression where the surface may move, elsewhere the neutral one."""
         moved, neutral = deformation.maps
         return torch.where(self.grid.to_map(self.deformable)[0], moved, neutral)
 

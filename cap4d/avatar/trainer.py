@@ -31,6 +31,7 @@ from cap4d.avatar.views import FitView, spread
 from cap4d.avatar.worth import removal_errors
 from cap4d.bind import triangle_frames
 from cap4d.camera import opencv_from_rig
+from cap4d.errors import Cap4dError
 from cap4d.raster import Rasterized, rasterize
 from cap4d.raster.rasterize import Backend
 
@@ -91,18 +92,27 @@ class Trainer:
         self.restore(state)
 
     def advance(self) -> float:
-        """Takes one step and returns its loss."""
+        """Takes one step and returns its loss.
+
+        Raises:
+            Cap4dError: The loss is not finite; no parameter was changed.
+        """
         self._set_rates()
         view = self.views[self._view_index()]
         posed, rendered = self.render(view, noise=self.preset.expression_noise)
         loss = self._loss(view, posed, rendered)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        value = loss.item()
+        if not math.isfinite(value):
+            raise Cap4dError(
+                f"step {self.step}: the loss is {value} in frame {view.frame} of capture {view.capture + 1}"
+            )
         self.evidence.add(rendered.means2d.grad, rendered.radii)
         self.optimizer.step()
         self.step += 1
         self._refine()
-        return loss.item()
+        return value
 
     def render(self, view: FitView, *, noise: float = 0.0) -> tuple[Posed, Rasterized]:
         """The avatar as it should look in a view, with the corrections of its frame.
@@ -232,7 +242,12 @@ class Trainer:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Takes up a `state`. Its sizes must be those of this trainer but for the number of Gaussians."""
+        """Takes up a `state`. Its sizes must be those of this trainer but for the number of Gaussians.
+
+        Raises:
+            ValueError, KeyError, RuntimeError: They are not. The trainer is of no use then.
+        """
+        self._check_rows(state)
         self.step = state["step"]
         for name, value in state["gaussians"].items():
             self.model.gaussians[name] = nn.Parameter(value.to(self.device))
@@ -247,6 +262,17 @@ class Trainer:
         self.evidence.gradient, self.evidence.seen, self.evidence.radius = (
             x.to(self.device) for x in state["evidence"]
         )
+
+    def _check_rows(self, state: dict[str, Any]) -> None:
+        """That every Gaussian has all its values and a triangle there is."""
+        binding = state["binding"]
+        n, triangles = len(binding), len(self.faces)
+        if binding.dtype != torch.int32 or n == 0 or not 0 <= binding.min() <= binding.max() < triangles:
+            raise ValueError(f"binding: expected int32[N] below {triangles}")
+        rows = {name: (n, *value.shape[1:]) for name, value in self.model.gaussians.items()}
+        found = {name: tuple(state["gaussians"][name].shape) for name in rows}
+        if found != rows or any(x.shape != (n,) for x in state["evidence"]):
+            raise ValueError(f"gaussians: expected {rows}, got {found}")
 
 
 def rotation_term(
