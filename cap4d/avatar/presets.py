@@ -1,32 +1,10 @@
 """How long and how finely an avatar is fitted: recipes, and in each the presets default, medium, low, debug.
 
 `released` are the values of the released CAP4D code (facts 26-38), `paper` the paper's where it differs, and
-`short` is for CPUs. Side by side:
-
-| | released | paper | short |
-|---|---|---|---|
-| steps (default, medium, low, debug) | 100k, 50k, 25k, 1k | same | 10k, 5k, 2.5k, 500 |
-| image | 512 px | same | 512, 384, 256, 256 px |
-| U-Net's first channels, its L2 decay | 64, 2e-3 | same | 64, 32, 16, 16; none |
-| U-Net's learning rate | 1e-5 to 1e-7 | same | 3e-4 to 1e-5 |
-| first Gaussians, a triangle at least | 100k, 50k, 25k, 100k; 2 | same | 100k, 60k, 40k, 30k; 1 |
-| their first colours | grey | same | painted from the images |
-| growth | gradient above 1e-6 | same | as well, the largest, up to a given number |
-| split offset (fact 30) | world units | local units | local units |
-| opacity resets | with the first growth, every 20k | same | none |
-| L1 : 1 - SSIM | 0.6 : 0.4 | 0.8 : 0.2, GaussianAvatars' (no value given) | 0.6 : 0.4 |
-| squared error | none | none | 5 |
-| LPIPS | 0.1 x, share 0 to 0.9 | 1 x, share 0 to 0.9 (no factor given) | none |
-| matte term | none | none | 0.1 |
-| local means beyond the limit (face sizes) | 1e-3 (2.0) | same | 1e-2 (0.7) |
-| Laplacian of the deformation | 1.0 | none | 1.0 |
-| corrections | neck offsets, penalty 1.0 | none | of all tracked (one camera), or none |
-| Adam's eps: Gaussians; necks | 1e-15; 1e-18 | same | 1e-8; 1e-15 |
-
-A short schedule needs larger steps: its learning rates are the released ones times what the shorter road asks
-for, decayed log-linearly as there. References are fitted from the original pixels in every recipe (the
-released code fits VAE round trips of them, the paper the references themselves). The Gaussians' floor and the
-split offset can be chosen apart from the recipe, see `Choices`.
+`short` is for CPUs: docs/recipes.md has them side by side, every constant. A short schedule needs larger
+steps: its learning rates are the released ones times what the shorter road asks for, decayed log-linearly as
+there.
+The Gaussians' floor, the split offset and some more can be chosen apart from the recipe, see `Choices`.
 """
 
 from __future__ import annotations
