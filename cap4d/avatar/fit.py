@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 ABLATIONS = (None, "unet", "lpips", "remesh", "mmdm")
 PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
+LOST_SECONDS = 600.0  # of work that a kill may cost, however slow the steps
 
 
 @contextmanager
@@ -243,7 +244,7 @@ def run(trainer: Trainer, save: Callable[[], None]) -> float:
     """
     preset = trainer.preset
     begun, first = time.monotonic(), trainer.step
-    spoke, losses, pace = begun, [], 0.0
+    spoke, saved, losses, pace = begun, begun, [], 0.0
     with pausing() as pause:
         while trainer.step < preset.iterations:
             losses.append(trainer.advance())
@@ -252,8 +253,9 @@ def run(trainer: Trainer, save: Callable[[], None]) -> float:
             if now - spoke > REPORT_SECONDS or trainer.step == preset.iterations:
                 log.info("%s", progress(trainer, float(np.mean(losses)), pace))
                 spoke, losses = now, []
-            if pause.asked or trainer.step % preset.checkpoint_every == 0:
+            if pause.asked or trainer.step % preset.checkpoint_every == 0 or now - saved > LOST_SECONDS:
                 save()
+                saved = time.monotonic()
             if pause.asked:
                 log.info("stopped after step %d: the same command with --resume goes on", trainer.step)
                 raise KeyboardInterrupt
@@ -264,9 +266,17 @@ def progress(trainer: Trainer, loss: float, pace: float) -> str:
     """Where a fit is; `pace` in seconds a step."""
     return (
         f"step {trainer.step}/{trainer.preset.iterations}  loss {loss:.4f}  {len(trainer.model)} Gaussians  "
-        f"{1e3 * pace:.0f} ms a step  {peak_memory_mb():.0f} MB  "
+        f"{1e3 * pace:.0f} ms a step  {memory(trainer.device)}  "
         f"{duration((trainer.preset.iterations - trainer.step) * pace)} left"
     )
+
+
+def memory(device: torch.device) -> str:
+    """`512 MB`, and what the GPU gave at most."""
+    ours = f"{peak_memory_mb():.0f} MB"
+    if device.type != "cuda":
+        return ours
+    return f"{ours} + {torch.cuda.max_memory_allocated(device) / 2**20:.0f} MB on the GPU"
 
 
 def finish(

@@ -120,7 +120,7 @@ class Preset:
         expression_noise: Standard deviation added to the expressions the network sees while it is fitted,
             so that it learns what an expression does, not what else happened in its frame; rig units.
         paint: Take the first colours from the images instead of grey (fact 29).
-        checkpoint_every: Steps between checkpoints.
+        checkpoint_every: Steps between checkpoints, unless they take so long that one is due before.
     """
 
     name: str
@@ -241,6 +241,7 @@ def _released(
         corrections="neck",
         rotation_every=1,
         paint=False,
+        checkpoint_every=2_000,
     )
 
 

@@ -1,5 +1,6 @@
 """What a step must be: the same every time."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,8 +8,9 @@ import pytest
 import torch
 from tiny_avatar import tiny_avatar, tiny_camera, tiny_rig, write_tiny_capture
 
+from cap4d.avatar import fit as fit_module
 from cap4d.avatar.corrections import Uncorrected
-from cap4d.avatar.fit import fit
+from cap4d.avatar.fit import fit, memory, run
 from cap4d.avatar.presets import PRESETS
 from cap4d.avatar.trainer import Trainer, rotation_term
 from cap4d.avatar.views import FitView
@@ -53,6 +55,23 @@ def trainer(tmp_path):
     capture = Capture.load(tmp_path / "sheet")
     view = FitView(0, 1, tiny_camera(16), torch.rand(16, 16, 3).half(), None)
     return Trainer(tiny_avatar(tiny_rig()), [Uncorrected(capture)], [view], PRESETS["debug"], seed=0)
+
+
+def test_slow_steps_are_saved_before_their_turn(trainer, monkeypatch):
+    trainer.preset = replace(trainer.preset, iterations=5, checkpoint_every=4)
+    saved = []
+    run(trainer, lambda: saved.append(trainer.step))
+    assert saved == [4]
+    monkeypatch.setattr(fit_module, "LOST_SECONDS", 0.0)
+    trainer.step, saved[:] = 0, []
+    run(trainer, lambda: saved.append(trainer.step))
+    assert saved == [1, 2, 3, 4, 5]
+
+
+def test_the_gpus_memory_is_told(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 3 * 2**20)
+    assert re.fullmatch(r"\d+ MB \+ 3 MB on the GPU", memory(torch.device("cuda")))
+    assert re.fullmatch(r"\d+ MB", memory(torch.device("cpu")))
 
 
 def test_a_loss_that_is_not_finite_ends_the_fit_and_spoils_nothing(trainer):
