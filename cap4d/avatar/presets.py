@@ -148,11 +148,7 @@ class Preset:
 class Choices:
     """What may be chosen apart from preset and recipe; None leaves it to them.
 
-    Measured on a synthetic ICT capture (288 training images of 128 px, 32 held out, 200 steps, one seed),
-    held out: pruning by contribution 30.01 -> 30.16 dB at 40,000 Gaussians, in 16 s instead of 14; a floor of
-    0, 1 and 2 where 8,000 Gaussians were asked for: 28.88, 30.09, 31.11 dB with 12,000, 26,126 and 51,942;
-    where most growth is splitting, offsets in local units 29.47 dB, in world units 29.88 dB: in a fit
-    so short, children that start where the parent was are the better ones.
+    What they were measured to be worth is in docs/recipes.md.
 
     Args:
         perceptual: `none`, `lpips`, or `gradient`, the stand-in without weights.
