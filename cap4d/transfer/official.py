@@ -41,6 +41,7 @@ KEYS = ("shape", "base_rot", "deform_net", "gaussians")
 N_GAUSSIAN_FIELDS = 14
 N_FACES = 28_120  # of the released grid (fact 18)
 MAX_WIDTH = 256
+MAX_NETWORK_VALUES = 1 << 29  # of the widest, with room
 DEFAULT_SIZE, DEFAULT_DISTANCE = 512, 1.469153  # px and m of the released sample sequences (fact 47)
 DEFAULT_CENTRE = 257.3, 269.5  # px, the same
 DEFAULT_FOCAL = 2200.0  # px; theirs is 2605, which cuts hair
@@ -271,7 +272,7 @@ def _harmonics(file: TorchFile, rest: Any, degree: Any, n: int) -> np.ndarray:
         expected = "harmonics of a degree up to 3"
         raise DataError(file.path, "_features_rest", expected=expected, found=list(values.shape))
     if type(degree) is not int or not 0 <= degree <= SH_COUNTS[count]:
-        expected, found = f"0 to {SH_COUNTS[count]}", str(degree)[:40]
+        expected, found = f"0 to {SH_COUNTS[count]}", degree if _is_short(degree) else _kind(degree)
         raise DataError(file.path, "active_sh_degree", expected=expected, found=found)
     return np.ascontiguousarray(values[:, : (degree + 1) ** 2 - 1])
 
@@ -305,6 +306,10 @@ def _network(file: TorchFile, state: Any) -> dict[str, np.ndarray]:
     if len(shape) != 4 or not 1 <= shape[0] <= MAX_WIDTH or shape[1:] != (3 + ENCODING_CHANNELS, 4, 4):
         expected, found = f"[1 to {MAX_WIDTH}, {3 + ENCODING_CHANNELS}, 4, 4]", list(shape) or "nothing"
         raise DataError(file.path, f"deform_net {first}", expected=expected, found=found)
+    size = sum(value.count for value in state.values() if isinstance(value, TensorRecord))
+    if size > MAX_NETWORK_VALUES:  # many tensors may be of one storage
+        expected = f"at most {MAX_NETWORK_VALUES} numbers"
+        raise DataError(file.path, "deform_net", expected=expected, found=size)
     return {
         name: _floats(file, f"deform_net {name[:80]}", value, (None,) * len(getattr(value, "shape", (0,))))
         for name, value in state.items()
@@ -343,6 +348,11 @@ def _check_shape(path: Path, field: str, value: Any, shape: tuple[int | None, ..
     if not fits or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
         expected = f"[{', '.join('*' if n is None else str(n) for n in shape)}]"
         raise DataError(path, field, expected=expected, found=list(value.shape))
+
+
+def _is_short(value: Any) -> bool:
+    """Whether it is a number that can be shown. What holds itself many times over takes for ever to print."""
+    return type(value) is int and abs(value) < 1 << 32
 
 
 def _kind(value: Any) -> str:
