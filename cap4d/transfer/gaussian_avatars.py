@@ -22,6 +22,7 @@ from cap4d.bundle.writer import write_bundle
 from cap4d.camera import Camera, opencv_from_rig, orbit_camera
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError, DataError
+from cap4d.harmonics import rotate_sh
 from cap4d.player.avatar import Avatar
 from cap4d.player.png import encode_png
 from cap4d.rig.flame import (
@@ -46,7 +47,6 @@ from cap4d.transfer.flame_chain import (
 )
 from cap4d.transfer.flame_teeth import with_teeth
 from cap4d.transfer.gaussian_ply import BoundGaussians, read_gaussian_ply
-from cap4d.transfer.harmonics import turned_harmonics
 
 log = logging.getLogger(__name__)
 
@@ -192,7 +192,7 @@ def make_bundle(
         quats=gaussians.quats,
         log_scales=gaussians.log_scales,
         opacity_logits=gaussians.opacity_logits,
-        sh=turned_harmonics(gaussians.sh, opencv_from_rig(pose[0])),
+        sh=rotate_sh(gaussians.sh, opencv_from_rig(pose[0]).T),  # from the world to the head
         binding=gaussians.binding,
         camera=_front_view(flame, subject),
         idle=_clip(sequence, motion, pose, name=name, fps=fps),

@@ -26,7 +26,6 @@ from cap4d.rotation import axis_angle_to_rotmat
 from cap4d.transfer.flame_teeth import N_TEETH, teeth_faces, with_teeth
 from cap4d.transfer.gaussian_avatars import import_gaussian_avatars, read_edition, read_sequence
 from cap4d.transfer.gaussian_ply import read_gaussian_ply
-from cap4d.transfer.harmonics import turned_harmonics
 
 FLIP = np.float64([1, -1, -1])
 VERTICES, FACES = 5023 + 120, 9976 + 168
@@ -170,19 +169,6 @@ def test_the_file_is_an_avatar_on_the_rigs_own_triangles(
     assert np.abs(bundle.idle.rot.mean(0)).max() < 0.05 and np.abs(bundle.idle.tra.mean(0)).max() < 1e-6
     picture = Avatar(bundle).draw(bundle.idle.frame(2), bundle.camera)
     assert (picture[..., 3] > 0).any(1).sum() > 100  # rows that the head fills
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics_are_those_of_the_turned_direction(degree: int) -> None:
-    rng = np.random.default_rng(degree)
-    sh = rng.normal(size=(7, (degree + 1) ** 2, 3)).astype(np.float32)
-    rotation = axis_angle_to_rotmat(np.array([0.4, -1.1, 0.7])) * FLIP
-    directions = rng.normal(size=(7, 3))
-    there, here = (
-        eval_sh(torch.from_numpy(s.astype(np.float64)), torch.from_numpy(d), degree).numpy()
-        for s, d in ((sh, directions @ rotation.T), (turned_harmonics(sh, rotation), directions))
-    )
-    np.testing.assert_allclose(here, there, atol=1e-5)
 
 
 def test_harmonics_are_seen_from_the_mean_pose(bundle: Bundle, invented: Invented, flame: FlameModel) -> None:
