@@ -22,6 +22,10 @@ import torch
 from official_checkpoint import write_official
 from test_road import run
 from torch.nn import functional
+from x_server import PLAY, needs_x
+from x_server import run as run_window
+
+from cap4d.capture.image import read_image
 
 SIZE, STD = 128, 0.0108
 FLIP = np.array([1.0, -1.0, -1.0])  # fact 10
@@ -267,13 +271,20 @@ def test_it_poses_as_the_released_code_does(road: Path, shared: Path) -> None:
     np.testing.assert_array_equal(avatar.bundle.sh[:, 1:], fields[3].detach())
 
 
-def test_it_plays(road: Path, shared: Path) -> None:
+def test_it_plays_headless(road: Path, shared: Path) -> None:
     printed = run("inspect", road / "avatar.cap4d")
     assert "flame2023_no_jaw" in printed and "30000" in printed.replace(",", "")
-    out = road / "out_%02d.png"
     run("view", road / "avatar.cap4d", "--headless", "--backend", "cpu", "--size", "128x128", "--frames", 3,
-        "--drive", shared / "flame/sequence_00/fit.npz", "--out", out)  # fmt: skip
-    assert len(list(road.glob("out_*.png"))) == 3
+        "--drive", shared / "flame/sequence_00/fit.npz", "--out", road / "out_%02d.png")  # fmt: skip
+    first, *_, last = (read_image(path).astype(float) for path in sorted(road.glob("out_*.png")))
+    assert (np.abs(first - last).max(-1) > 0.06).sum() > 100, "the sequence moves the face"
+
+
+@needs_x
+def test_it_plays_in_the_window(road: Path) -> None:
+    found, said = run_window(PLAY.replace("NAME", "'avatar.cap4d'"), road)
+    assert found["rig"] == "flame2023_no_jaw" and found["tier"] != "off"
+    assert found["messages"] == [] and said == ""
 
 
 def test_bad_files_are_refused_with_one_line_and_nothing_is_written(road: Path, shared: Path) -> None:
