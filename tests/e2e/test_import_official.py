@@ -274,10 +274,10 @@ def test_it_poses_as_the_released_code_does(road: Path, shared: Path) -> None:
 def test_it_plays_headless(road: Path, shared: Path) -> None:
     printed = run("inspect", road / "avatar.cap4d")
     assert "flame2023_no_jaw" in printed and "30000" in printed.replace(",", "")
-    run("view", road / "avatar.cap4d", "--headless", "--backend", "cpu", "--size", "128x128", "--frames", 12,
+    run("view", road / "avatar.cap4d", "--headless", "--backend", "cpu", "--size", "128x128", "--frames", 60,
         "--drive", shared / "flame/sequence_00/fit.npz", "--out", road / "out_%02d.png")  # fmt: skip
     first, *_, last = (read_image(path).astype(float) for path in sorted(road.glob("out_*.png")))
-    assert (np.abs(first - last).max(-1) > 0.02).sum() > 100, "the sequence moves the face"
+    assert (np.abs(first - last).max(-1) > 0.06).sum() > 100, "the sequence moves the face"
 
 
 @needs_x
