@@ -51,6 +51,7 @@ from cap4d.transfer.gaussian_ply import BoundGaussians, read_gaussian_ply
 log = logging.getLogger(__name__)
 
 LICENCE = "LicenseRef-FLAME"
+PARAMS = "flame_param.npz"
 FPS = 25.0  # the files say none
 MIN_FPS, MAX_FPS = 0.1, 1000.0  # of an idle clip
 USEFUL = (-3.0, 3.0)  # standard deviations of FLAME's expressions
@@ -97,12 +98,14 @@ class FlameSequence:
     translation: np.ndarray
 
 
-def import_gaussian_avatars(ply: Path, output: Path, *, params: Path, flame: Path, fps: float = FPS) -> None:
+def import_gaussian_avatars(
+    ply: Path, output: Path, *, flame: Path, params: Path | None = None, fps: float = FPS
+) -> None:
     """Writes `output`, a `.cap4d` file.
 
     Args:
         ply: `point_cloud.ply`.
-        params: `flame_param.npz` beside it.
+        params: `flame_param.npz`; None: that beside it.
         flame: FLAME 2020 or 2023 with a jaw, the pickle that the avatar was fitted with.
         fps: Of the sequence.
     Raises:
@@ -111,6 +114,7 @@ def import_gaussian_avatars(ply: Path, output: Path, *, params: Path, flame: Pat
     """
     if not MIN_FPS <= fps <= MAX_FPS:
         raise ArgumentError(f"fps: expected {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}")
+    params = ply.with_name(PARAMS) if params is None else params
     model = with_teeth(read_edition(flame))
     sequence = read_sequence(params, vertices=len(model.template))
     gaussians = read_gaussian_ply(ply, faces=len(model.faces))

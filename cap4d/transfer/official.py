@@ -170,9 +170,7 @@ def avatar_model(official: OfficialAvatar, rig: HeadRig, grid: UvGrid, *, source
     Raises:
         DataError: Its network has other layers than the released one (fact 22).
     """
-    valid = np.zeros((grid.size, grid.size), bool)
-    valid[grid.pixels[:, 0], grid.pixels[:, 1]] = True
-    deformer = Deformer(valid, width=official.width)
+    deformer = Deformer(grid.valid, width=official.width)
     _check_layers(source, official.network, deformer)
     deformer.load_state_dict({name: torch.from_numpy(value) for name, value in official.network.items()})
     gaussians = {name: torch.from_numpy(value) for name, value in official.gaussians.items()}

@@ -190,7 +190,7 @@ def test_the_commands_import_and_play_it(
     pickle: Path, invented: Invented, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     ply, params = invented.write(tmp_path)
-    files = [str(ply), "--params", str(params), "--flame", str(pickle)]
+    files = [str(ply), "--flame", str(pickle)]
     avatar = tmp_path / "a.cap4d"
     assert main(["import", "gaussian-avatars", *files, "-o", str(avatar)]) == 0
     assert main(["inspect", str(avatar)]) == 0
@@ -202,6 +202,9 @@ def test_the_commands_import_and_play_it(
     ply.write_bytes(ply.read_bytes()[:-1])
     assert main(["import", "gaussian-avatars", *files, "-o", str(tmp_path / "b.cap4d")]) == 1
     assert "data: expected" in capsys.readouterr().err and not (tmp_path / "b.cap4d").exists()
+    params.unlink()
+    assert main(["import", "gaussian-avatars", *files, "-o", str(tmp_path / "b.cap4d")]) == 1
+    assert "flame_param.npz: file: expected an .npz archive, found no such file" in capsys.readouterr().err
 
 
 # What is refused ------------------------------------------------------------
