@@ -7,6 +7,7 @@ import numpy as np
 from cap4d.gaussians import SH_COUNTS
 from cap4d.rotation import Array, namespace
 
+SH_0 = 0.28209479177387814  # the one that all directions share
 DIRECTIONS = 64  # to tell the harmonics of degree 3 apart, 16 would do
 
 
@@ -16,7 +17,7 @@ def sh_basis(directions: Array, degree: int) -> Array:
     x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
     xx, yy, zz = x * x, y * y, z * z
     bands = [
-        [0.28209479177387814 * xp.ones_like(x)],
+        [SH_0 * xp.ones_like(x)],
         [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x],
         [
             1.0925484305920792 * x * y,

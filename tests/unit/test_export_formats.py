@@ -275,6 +275,10 @@ def test_what_knows_no_gaussians_sees_the_points_of_a_glb(tmp_path):
     scene = trimesh.load_scene(tmp_path / "x.glb")
     (points,) = scene.geometry.values()
     np.testing.assert_allclose(points.vertices, gaussians.means * FLIP)
+    rgb = np.clip(0.5 + 0.2820948 * gaussians.sh[:, 0].astype(float), 0, 1)
+    light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    expected = np.column_stack([light, gaussians.opacities])
+    np.testing.assert_allclose(points.visual.vertex_colors / 255, expected, atol=0.003)
 
 
 READERS = {
