@@ -263,8 +263,8 @@ def test_broken_gaussians_are_refused(name: str, tmp_path: Path) -> None:
     [
         ("x", np.nan, "x"),
         ("opacity", -np.inf, "opacity"),
-        ("f_dc_1", 1e30, "sh"),
-        ("scale_2", 50, "log_scales"),
+        ("f_dc_1", 1e30, "f_dc_*, f_rest_*"),
+        ("scale_2", 50, "scale_0 to scale_2"),
         ("binding_0", 50, "binding_0"),
         ("binding_0", -1, "binding_0"),
         ("binding_0", 0.5, "binding_0"),
