@@ -259,8 +259,6 @@ def create_avatar(
     local, binding = initial_gaussians(counts, sh_degree=sh_degree, generator=generator)
     deformer = None
     if deformer_width is not None:
-        valid = np.zeros((grid.size, grid.size), bool)
-        valid[grid.pixels[:, 0], grid.pixels[:, 1]] = True
-        deformer = Deformer(valid, width=deformer_width, generator=generator)
+        deformer = Deformer(grid.valid, width=deformer_width, generator=generator)
     subject = remesh(rig.subject(np.asarray(shape, np.float32)), grid)
     return AvatarModel(subject, grid, local, binding, deformer)
