@@ -33,7 +33,7 @@ def save_checkpoint(state: dict[str, Any], path: Path) -> None:
     """Writes `state` through a temporary file and a rename; what was there becomes the previous one."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    payload = buffer.getvalue()
+    payload = buffer.getbuffer()
     with replacing(path) as temporary:
         with open(temporary, "wb") as file:
             file.write(MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n")

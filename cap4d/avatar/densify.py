@@ -108,7 +108,9 @@ def densify(
     """
     n = len(rows.model)
     world = rows.model.gaussians["log_scales"].detach().exp().amax(1) * face_sizes[rows.model.binding]
-    needless = _least(worth, settings.prune_least, n)
+    needless = torch.zeros_like(world, dtype=torch.bool)
+    if worth is not None:
+        needless[worth.topk(int(settings.prune_least * n), largest=False).indices] = True
     if per_face >= 1:
         needless &= ~_last_of_their_face(needless, rows.model, len(face_sizes))
     freed = None if room is None else room + int(needless.sum())
@@ -128,16 +130,8 @@ def densify(
 
 def reset_opacity(rows: Rows) -> None:
     """Lowers every opacity to at most 0.01, so that those nobody needs fade (Kerbl et al. 2023, sec. 5.2)."""
-    ceiling = torch.tensor(RESET_OPACITY).logit()
+    ceiling = torch.tensor(RESET_OPACITY, device="cpu").logit().item()
     rows.overwrite("opacity_logits", rows.model.gaussians["opacity_logits"].detach().clamp(max=ceiling))
-
-
-def _least(worth: torch.Tensor | None, share: float, n: int) -> torch.Tensor:
-    """bool[N]: the share that is worth least; none where nothing is known."""
-    chosen = torch.zeros(n, dtype=torch.bool, device=None if worth is None else worth.device)
-    if worth is not None and share > 0:
-        chosen[worth.topk(int(share * n), largest=False).indices] = True
-    return chosen
 
 
 def _most_wanted(gradient: torch.Tensor, threshold: float, room: int | None) -> torch.Tensor:
@@ -168,11 +162,12 @@ def _split(
     # `chosen` speaks of the rows before cloning appended to them.
     index = chosen.nonzero()[:, 0].repeat(CHILDREN)
     children = {name: value.detach()[index].clone() for name, value in rows.model.gaussians.items()}
-    noise = torch.randn(len(index), 3, generator=generator).to(index.device) * children["log_scales"].exp()
+    noise = torch.randn(len(index), 3, generator=generator, device=generator.device).to(index.device)
+    noise *= children["log_scales"].exp()
     if offset_sizes is not None:
         noise *= offset_sizes[rows.model.binding[index], None]
     children["means"] += (quat_to_rotmat(children["quats"]) @ noise[:, :, None])[:, :, 0]
-    children["log_scales"] -= torch.log(torch.tensor(SPLIT_SHRINK))
+    children["log_scales"] -= torch.tensor(SPLIT_SHRINK, device="cpu").log().item()
     rows.append(children, rows.model.binding[index])
 
 

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from cap4d.avatar.checkpoint import load_latest, remove_checkpoints, save_checkpoint
 from cap4d.avatar.corrections import corrections_named
 from cap4d.avatar.device import device_named
+from cap4d.avatar.journal import Journal
 from cap4d.avatar.losses import Distance, Perceptual, gradient_distance
 from cap4d.avatar.model import create_avatar
 from cap4d.avatar.paint import paint
@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 ABLATIONS = (None, "unet", "lpips", "remesh", "mmdm")
 PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
+LOST_SECONDS = 600.0  # of work that a kill may cost, however slow the steps
 
 
 @contextmanager
@@ -94,70 +95,72 @@ def fit(
         ArgumentError: An unknown preset or ablation, or no frame to train on.
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
     """
-    if ablate not in ABLATIONS:
-        raise ArgumentError(f"ablate: expected unet, lpips, remesh or mmdm, got {ablate!r}")
-    if ablate == "mmdm":
-        captures = captures[:1]
+    started = time.monotonic()
     if not output.parent.is_dir() or output.is_dir():
         raise ArgumentError(f"output: expected a file in a folder that exists, got {output}")
-    settings = preset_named(preset) if isinstance(preset, str) else preset
     place = device_named(device)
-    if ablate == "lpips":
-        settings = replace(settings, perceptual=Perceptual())
+    settings = settled(preset, ablate)
     perceptual = distance_of(settings.perceptual, lpips_weights, place)
-    started = time.monotonic()
-    loaded = [Capture.load(path) for path in captures]
-    for capture in loaded:
-        check_rig(capture, rig)
+    loaded = load_captures(captures[:1] if ablate == "mmdm" else captures, rig)
     selection = select(loaded[0], references, hold_out)
     split = split_captures(loaded, selection, settings.image_size)
     settings = suited(settings, len(split.train))
     trainer = prepare(loaded, split, rig, settings, ablate=ablate, seed=seed, perceptual=perceptual)
-    checkpoint = output.with_suffix(".fit.ckpt")
-    data = fingerprint(captures, settings, selection)
-    left_out = "" if perceptual or settings.perceptual.kind == "none" else ", without LPIPS"
-    kind = f"preset {settings.name}{left_out}, rig {rig.name}, ablate {ablate}, seed {seed}, data {data}"
-    spent = 0.0
-    state = load_latest(checkpoint, kind=kind) if resume else None
-    if state is not None:
-        trainer.restore(state["trainer"])
-        spent = state["seconds"]
-        log.info("%s: going on at step %d", checkpoint, trainer.step)
+    kind = f"{kind_of(trainer, rig, ablate)}, data {fingerprint(loaded, settings, selection)}"
+    journal = Journal(output.with_suffix(".fit.ckpt"), kind=kind, started=started)
+    if resume:
+        journal.take_up(trainer)
     trainer.move(place)
-
-    def seconds() -> float:
-        return spent + time.monotonic() - started
-
-    def save() -> None:
-        save_checkpoint({"kind": kind, "trainer": trainer.state(), "seconds": seconds()}, checkpoint)
-
     log.info("%s", outlook(trainer, split, place))
-    pace = run(trainer, save)
+    pace = run(trainer, lambda: journal.save(trainer))
     trainer.move(torch.device("cpu"))
-    report = finish(
-        trainer,
-        loaded,
-        split,
-        rig,
-        output,
-        ablate=ablate,
-        seconds=seconds,
-        pace=pace,
-        device=place,
-        tiers=tiers,
-    )
-    remove_checkpoints(checkpoint)
+    rest = {"device": place, "seconds": journal.seconds, "pace": pace, "tiers": tiers}
+    report = finish(trainer, loaded[0], split, rig, output, ablate=ablate, **rest)
+    journal.close()
     return report
 
 
+def settled(preset: str | Preset, ablate: str | None) -> Preset:
+    """The preset, without what is ablated of it.
+
+    Raises:
+        ArgumentError: An unknown preset or ablation.
+    """
+    if ablate not in ABLATIONS:
+        raise ArgumentError(f"ablate: expected unet, lpips, remesh or mmdm, got {ablate!r}")
+    settings = preset_named(preset) if isinstance(preset, str) else preset
+    return replace(settings, perceptual=Perceptual()) if ablate == "lpips" else settings
+
+
+def load_captures(paths: Sequence[Path], rig: HeadRig) -> list[Capture]:
+    """
+    Raises:
+        ArgumentError: There are none.
+        DataError: A capture is malformed or of another rig.
+    """
+    if not paths:
+        raise ArgumentError("captures: expected at least one, got none")
+    loaded = [Capture.load(path) for path in paths]
+    for capture in loaded:
+        check_rig(capture, rig)
+    return loaded
+
+
+def kind_of(trainer: Trainer, rig: HeadRig, ablate: str | None) -> str:
+    """What a checkpoint says that it is of."""
+    preset = trainer.preset
+    missing = trainer.perceptual is None and preset.perceptual.kind != "none"
+    left_out = ", without LPIPS" if missing else ""
+    return f"preset {preset.name}{left_out}, rig {rig.name}, ablate {ablate}, seed {trainer.seed}"
+
+
 def outlook(trainer: Trainer, split: Split, device: torch.device) -> str:
-    """`fitting 80 images up to 256x256, 20 held out: preset low, recipe short, 2500 steps, on cpu`"""
+    """`fitting 80 images up to 256x256, 20 held out: preset low, recipe short, 2500 steps from 0, ...`"""
     preset = trainer.preset
     width, height = (max(getattr(v.camera, side) for v in split.train) for side in ("width", "height"))
-    recipe = f", recipe {preset.recipe}" if getattr(preset, "recipe", None) else ""
     return (
         f"fitting {len(split.train)} images up to {width}x{height}, {len(split.held_out)} held out: "
-        f"preset {preset.name}{recipe}, {preset.iterations} steps from {trainer.step}, "
+        f"preset {preset.name}, recipe {preset.recipe}, {preset.iterations} steps from {trainer.step}, "
         f"{len(trainer.model)} Gaussians, on {device.type}"
     )
 
@@ -224,11 +227,11 @@ def split_captures(captures: Sequence[Capture], selection: Selection | None, ima
     return split_selected(captures, selection, image_size)
 
 
-def fingerprint(captures: Sequence[Path], settings: Preset, selection: Selection | None = None) -> str:
+def fingerprint(captures: Sequence[Capture], settings: Preset, selection: Selection | None = None) -> str:
     """Twelve hex digits that change with settings, selection and what was tracked: whose checkpoint it is."""
     digest = hashlib.sha256(repr(settings if selection is None else (settings, selection)).encode())
-    for path in captures:
-        digest.update((path / "fit.npz").read_bytes())
+    for capture in captures:
+        digest.update((capture.path / "fit.npz").read_bytes())
     return digest.hexdigest()[:12]
 
 
@@ -243,7 +246,7 @@ def run(trainer: Trainer, save: Callable[[], None]) -> float:
     """
     preset = trainer.preset
     begun, first = time.monotonic(), trainer.step
-    spoke, losses, pace = begun, [], 0.0
+    spoke, saved, losses, pace = begun, begun, [], 0.0
     with pausing() as pause:
         while trainer.step < preset.iterations:
             losses.append(trainer.advance())
@@ -252,8 +255,9 @@ def run(trainer: Trainer, save: Callable[[], None]) -> float:
             if now - spoke > REPORT_SECONDS or trainer.step == preset.iterations:
                 log.info("%s", progress(trainer, float(np.mean(losses)), pace))
                 spoke, losses = now, []
-            if pause.asked or trainer.step % preset.checkpoint_every == 0:
+            if pause.asked or trainer.step % preset.checkpoint_every == 0 or now - saved > LOST_SECONDS:
                 save()
+                saved = time.monotonic()
             if pause.asked:
                 log.info("stopped after step %d: the same command with --resume goes on", trainer.step)
                 raise KeyboardInterrupt
@@ -264,20 +268,46 @@ def progress(trainer: Trainer, loss: float, pace: float) -> str:
     """Where a fit is; `pace` in seconds a step."""
     return (
         f"step {trainer.step}/{trainer.preset.iterations}  loss {loss:.4f}  {len(trainer.model)} Gaussians  "
-        f"{1e3 * pace:.0f} ms a step  {peak_memory_mb():.0f} MB  "
+        f"{1e3 * pace:.0f} ms a step  {memory(trainer.device)}  "
         f"{duration((trainer.preset.iterations - trainer.step) * pace)} left"
     )
 
 
+def memory(device: torch.device) -> str:
+    """`512 MB`, and what the GPU gave at most."""
+    ours = f"{peak_memory_mb():.0f} MB"
+    if device.type != "cuda":
+        return ours
+    return f"{ours} + {torch.cuda.max_memory_allocated(device) / 2**20:.0f} MB on the GPU"
+
+
 def finish(
-    trainer, captures, split, rig, output: Path, *, ablate, seconds, pace, device, tiers=True
+    trainer: Trainer,
+    capture: Capture,
+    split: Split,
+    rig: HeadRig,
+    output: Path,
+    *,
+    ablate: str | None,
+    device: torch.device,
+    seconds: Callable[[], float],
+    pace: float,
+    tiers: bool = True,
 ) -> FitReport:
-    """Compares with the held-out frames and writes avatar, numbers and picture."""
+    """Compares with the held-out frames and writes avatar, numbers and picture.
+
+    Args:
+        capture: The first one, whose clip and camera the avatar gets.
+        device: Where it was fitted; the trainer is back on the CPU.
+        seconds: How long it has taken.
+        pace: Mean time of a step, s.
+        tiers: See `fit`.
+    """
     from cap4d.export.bundle import export_bundle
 
     comparison = compare(trainer, split) if split.held_out else None
-    clip = trainer.corrections[0].corrected(captures[0].clip())
-    export_bundle(trainer.model, output, rig=rig, capture=captures[0], clip=clip, tiers=tiers)
+    clip = trainer.corrections[0].corrected(capture.clip())
+    export_bundle(trainer.model, output, rig=rig, capture=capture, clip=clip, tiers=tiers)
     if comparison is not None:
         write_sheet(comparison, output.with_suffix(".fit.png"))
     times = {"seconds": seconds(), "step_ms": 1e3 * pace}

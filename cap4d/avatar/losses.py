@@ -6,7 +6,7 @@ Facts 33-35.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -35,6 +35,10 @@ class LossWeights:
         deformation: Size of its expression-dependent part.
         rotation: Turning of the triangles by that part.
         pose: Learned corrections of head pose, expression, eyes and neck, or neck offsets.
+        measures: `released`: local means by their length, the deformation's size on the Gaussians, and its
+            roughness on the map that moves them; `quick`: by axis, on the grid's vertices, and on both of the
+            network's maps, for less work a step. Not in the repr, which names checkpoints: the recipe's name
+            is.
     """
 
     l1: float = 0.6
@@ -49,6 +53,7 @@ class LossWeights:
     deformation: float = 0.4
     rotation: float = 0.005
     pose: float = 1.0
+    measures: Literal["quick", "released"] = field(default="quick", repr=False)
 
 
 @dataclass(frozen=True)
@@ -170,6 +175,11 @@ def _blur(image: torch.Tensor) -> torch.Tensor:
 
 def position_loss(means: torch.Tensor, visible: torch.Tensor, limit: float) -> torch.Tensor:
     """How far local means [N, 3] (face sizes) of visible Gaussians bool[N] stray beyond `limit` (fact 34)."""
+    return _mean_over(F.relu(means.norm(dim=-1) - limit), visible)
+
+
+def axis_position_loss(means: torch.Tensor, visible: torch.Tensor, limit: float) -> torch.Tensor:
+    """The same along each axis, mean over the three."""
     return _mean_over(F.relu(means.abs() - limit).mean(-1), visible)
 
 
@@ -189,7 +199,7 @@ def laplacian_loss(deformation: torch.Tensor) -> torch.Tensor:
 
 
 def relative_deformation_loss(deformation: torch.Tensor, neutral: torch.Tensor) -> torch.Tensor:
-    """Mean squared length of what the expression adds to [G, 3] m deformations, over 0.0108 (fact 35)."""
+    """Mean squared length of what the expression adds to [N, 3] m positions, over 0.0108 (fact 35)."""
     return ((deformation - neutral) / DEFORM_STD).square().sum(-1).mean()
 
 

@@ -152,14 +152,7 @@ class AvatarModel(nn.Module):
         if rigid is not None:
             vertices = vertices @ rigid[0].T + rigid[1]
         local = self.gaussians
-        means, quats, scales = bind_to(
-            vertices,
-            self.faces,
-            means=local["means"],
-            quats=local["quats"],
-            log_scales=local["log_scales"],
-            binding=self.binding,
-        )
+        means, quats, scales = self.riding(vertices)
         return Posed(
             surface,
             deformation,
@@ -169,6 +162,16 @@ class AvatarModel(nn.Module):
             local["opacity_logits"].sigmoid(),
             torch.cat([local["sh_dc"], local["sh_rest"]], 1),
         )
+
+    def riding(self, vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """means [N, 3] m, quats [N, 4], scales [N, 3] m of the Gaussians on [G, 3] m vertices (fact 27)."""
+        local = {name: self.gaussians[name] for name in ("means", "quats", "log_scales")}
+        return bind_to(vertices, self.faces, **local, binding=self.binding)
+
+    def moving_map(self, deformation: Deformation) -> torch.Tensor:
+        """[3, S, S] m: the map of the expression where the surface may move, elsewhere the neutral one."""
+        moved, neutral = deformation.maps
+        return torch.where(self.grid.to_map(self.deformable)[0], moved, neutral)
 
     def neutral_deformation(self) -> torch.Tensor:
         """[G, 3] m: the network's answer to no offsets, a constant of the avatar (fact 24)."""
@@ -256,8 +259,6 @@ def create_avatar(
     local, binding = initial_gaussians(counts, sh_degree=sh_degree, generator=generator)
     deformer = None
     if deformer_width is not None:
-        valid = np.zeros((grid.size, grid.size), bool)
-        valid[grid.pixels[:, 0], grid.pixels[:, 1]] = True
-        deformer = Deformer(valid, width=deformer_width, generator=generator)
+        deformer = Deformer(grid.valid, width=deformer_width, generator=generator)
     subject = remesh(rig.subject(np.asarray(shape, np.float32)), grid)
     return AvatarModel(subject, grid, local, binding, deformer)

@@ -1,36 +1,15 @@
 """How long and how finely an avatar is fitted: recipes, and in each the presets default, medium, low, debug.
 
 `released` are the values of the released CAP4D code (facts 26-38), `paper` the paper's where it differs, and
-`short` is for CPUs. Side by side:
-
-| | released | paper | short |
-|---|---|---|---|
-| steps (default, medium, low, debug) | 100k, 50k, 25k, 1k | same | 10k, 5k, 2.5k, 500 |
-| image | 512 px | same | 512, 384, 256, 256 px |
-| U-Net's first channels, its L2 decay | 64, 2e-3 | same | 64, 32, 16, 16; none |
-| U-Net's learning rate | 1e-5 to 1e-7 | same | 3e-4 to 1e-5 |
-| first Gaussians, a triangle at least | 100k, 50k, 25k, 100k; 2 | same | 100k, 60k, 40k, 30k; 1 |
-| their first colours | grey | same | painted from the images |
-| growth | gradient above 1e-6 | same | as well, the largest, up to a given number |
-| split offset (fact 30) | world units | local units | local units |
-| opacity resets | with the first growth, every 20k | same | none |
-| L1 : 1 - SSIM | 0.6 : 0.4 | 0.8 : 0.2, GaussianAvatars' (no value given) | 0.6 : 0.4 |
-| squared error | none | none | 5 |
-| LPIPS | 0.1 x, share 0 to 0.9 | 1 x, share 0 to 0.9 (no factor given) | none |
-| matte term | none | none | 0.1 |
-| local means beyond the limit (face sizes) | 1e-3 (2.0) | same | 1e-2 (0.7) |
-| Laplacian of the deformation | 1.0 | none | 1.0 |
-| corrections | neck offsets, penalty 1.0 | none | of all tracked (one camera), or none |
-| Adam's eps: Gaussians; necks | 1e-15; 1e-18 | same | 1e-8; 1e-15 |
-
-A short schedule needs larger steps: its learning rates are the released ones times what the shorter road asks
-for, decayed log-linearly as there. References are fitted from the original pixels in every recipe (the
-released code fits VAE round trips of them, the paper the references themselves). The Gaussians' floor and the
-split offset can be chosen apart from the recipe, see `Choices`.
+`short` is for CPUs: docs/recipes.md has them side by side, every constant. A short schedule needs larger
+steps: its learning rates are the released ones times what the shorter road asks for, decayed log-linearly as
+there.
+The Gaussians' floor, the split offset and some more can be chosen apart from the recipe, see `Choices`.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -88,6 +67,8 @@ class Densify:
         prune_radius, prune_scale: Too large, px on a screen and m.
         reset_every: Period of lowering all opacities to at most 0.01, which also happens at `start`; 0:
             never.
+        bounds: Whether Gaussians grow at `start` and `stop` themselves, and resets may fall on `stop`
+            (`closed`), or not (`open`, as in the released code). Not in the repr, see `LossWeights`.
     """
 
     start: int
@@ -103,10 +84,18 @@ class Densify:
     prune_radius: float = 20.0
     prune_scale: float = 0.1
     reset_every: int = 0
+    bounds: Literal["closed", "open"] = field(default="closed", repr=False)
+
+    def grows_at(self, step: int) -> bool:
+        """Whether there is a round of growth after this step."""
+        if step % self.every or not self.start <= step <= self.stop:
+            return False
+        return self.bounds == "closed" or step not in (self.start, self.stop)
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are lowered after this step (fact 37)."""
-        if not self.reset_every or step > self.stop:
+        last = self.stop if self.bounds == "closed" else self.stop - 1
+        if not self.reset_every or step > last:
             return False
         return step == self.start or step % self.reset_every == 0
 
@@ -131,7 +120,7 @@ class Preset:
         expression_noise: Standard deviation added to the expressions the network sees while it is fitted,
             so that it learns what an expression does, not what else happened in its frame; rig units.
         paint: Take the first colours from the images instead of grey (fact 29).
-        checkpoint_every: Steps between checkpoints.
+        checkpoint_every: Steps between checkpoints, unless they take so long that one is due before.
     """
 
     name: str
@@ -159,11 +148,7 @@ class Preset:
 class Choices:
     """What may be chosen apart from preset and recipe; None leaves it to them.
 
-    Measured on a synthetic ICT capture (288 training images of 128 px, 32 held out, 200 steps, one seed),
-    held out: pruning by contribution 30.01 -> 30.16 dB at 40,000 Gaussians, in 16 s instead of 14; a floor of
-    0, 1 and 2 where 8,000 Gaussians were asked for: 28.88, 30.09, 31.11 dB with 12,000, 26,126 and 51,942;
-    where most growth is splitting, offsets in local units 29.47 dB, in world units 29.88 dB: in a fit
-    so short, children that start where the parent was are the better ones.
+    What they were measured to be worth is in docs/recipes.md.
 
     Args:
         perceptual: `none`, `lpips`, or `gradient`, the stand-in without weights.
@@ -220,7 +205,11 @@ def _released(
     reset_every: int,
     lpips: tuple[int, int],
 ) -> Preset:
-    """A row of fact 37's table; all the rest is common to its rows."""
+    """A row of fact 37's table; all the rest is common to its rows.
+
+    Its limit of 20 px on a Gaussian's radius is not among them: the released code forgets the radii before it
+    compares them.
+    """
     start, stop, every = densify
     return Preset(
         name=name,
@@ -239,13 +228,16 @@ def _released(
             most=None,
             split_offset="world",
             prune_big_after=reset_every,
+            prune_radius=math.inf,
             reset_every=reset_every,
+            bounds="open",
         ),
-        weights=LossWeights(matte=0.0),
+        weights=LossWeights(matte=0.0, measures="released"),
         perceptual=Perceptual.of("lpips", *lpips),
         corrections="neck",
         rotation_every=1,
         paint=False,
+        checkpoint_every=2_000,
     )
 
 

@@ -31,6 +31,8 @@ class FitReport:
     all frames, as in the field's usual protocol; so do the identity and the focal length.
 
     Args:
+        perceptual: What the perceptual term compared images by, `lpips` or `gradient`; `none` without one,
+            or without LPIPS's weights.
         held_out_psnr: Of the squared error pooled over all pixels of all held-out frames.
         nearest_frame_psnr: The same for the baseline: for every held-out frame the training frame of the same
             size that resembles it most (least squared error, so it is the best that replaying could do).
@@ -47,6 +49,8 @@ class FitReport:
     """
 
     preset: str
+    recipe: str
+    perceptual: str
     ablate: str | None
     iterations: int
     gaussians: int
@@ -159,11 +163,13 @@ def summarise(
         between, tail = comparison.summary(~comparison.tail), comparison.summary(comparison.tail)
     some = spread(split.train, TRAIN_VIEWS)
     pictures = render_views(trainer, some)
-    train_errors = np.array([mse(a, v.target.numpy()) for a, v in zip(pictures, some, strict=True)])
+    train_errors = [max(LEAST_MSE, mse(a, v.target.numpy())) for a, v in zip(pictures, some, strict=True)]
     names = ("held_out_psnr", "nearest_frame_psnr", "nearest_in_time_psnr", "held_out_psnr_mean")
     names += ("nearest_frame_psnr_mean", "held_out_ssim")
     return FitReport(
         preset=trainer.preset.name,
+        recipe=trainer.preset.recipe,
+        perceptual="none" if trainer.perceptual is None else trainer.preset.perceptual.kind,
         ablate=ablate,
         iterations=trainer.step,
         gaussians=len(trainer.model),
@@ -172,7 +178,7 @@ def summarise(
         **{name: everything.get(name) for name in names},
         between=between,
         tail=tail,
-        train_psnr=pooled_psnr(train_errors),
+        train_psnr=pooled_psnr(np.array(train_errors)),
         seconds=round(seconds, 1),
         step_ms=round(step_ms, 1),
         device=device,

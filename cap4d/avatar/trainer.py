@@ -6,7 +6,7 @@ All randomness is a function of the seed and the step, so a resumed fit repeats 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch import nn
 from cap4d.avatar.densify import Evidence, Rows, densify, reset_opacity
 from cap4d.avatar.losses import (
     Distance,
+    axis_position_loss,
     laplacian_loss,
     photometric,
     position_loss,
@@ -24,12 +25,13 @@ from cap4d.avatar.losses import (
     relative_rotation_loss,
     scale_loss,
 )
-from cap4d.avatar.model import AvatarModel, Posed
+from cap4d.avatar.model import AvatarModel, Deformation, Posed
 from cap4d.avatar.presets import Preset
 from cap4d.avatar.views import FitView, spread
 from cap4d.avatar.worth import removal_errors
 from cap4d.bind import triangle_frames
 from cap4d.camera import opencv_from_rig
+from cap4d.errors import Cap4dError
 from cap4d.raster import Rasterized, rasterize
 from cap4d.raster.rasterize import Backend
 
@@ -90,18 +92,27 @@ class Trainer:
         self.restore(state)
 
     def advance(self) -> float:
-        """Takes one step and returns its loss."""
+        """Takes one step and returns its loss.
+
+        Raises:
+            Cap4dError: The loss is not finite; no parameter was changed.
+        """
         self._set_rates()
         view = self.views[self._view_index()]
         posed, rendered = self.render(view, noise=self.preset.expression_noise)
         loss = self._loss(view, posed, rendered)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        value = loss.item()
+        if not math.isfinite(value):
+            raise Cap4dError(
+                f"step {self.step}: the loss is {value} in frame {view.frame} of capture {view.capture + 1}"
+            )
         self.evidence.add(rendered.means2d.grad, rendered.radii)
         self.optimizer.step()
         self.step += 1
         self._refine()
-        return loss.item()
+        return value
 
     def render(self, view: FitView, *, noise: float = 0.0) -> tuple[Posed, Rasterized]:
         """The avatar as it should look in a view, with the corrections of its frame.
@@ -143,19 +154,27 @@ class Trainer:
         loss = self._photometric(rendered.rgb, view.target)
         if view.coverage is not None and w.matte > 0:
             loss = loss + w.matte * (rendered.alpha - view.coverage.float()).abs().mean()
-        loss = loss + w.position * position_loss(local["means"], visible, w.position_limit)
+        stray = position_loss if w.measures == "released" else axis_position_loss
+        loss = loss + w.position * stray(local["means"], visible, w.position_limit)
         loss = loss + w.scale * scale_loss(local["log_scales"], visible, w.scale_limit)
         loss = loss + w.pose * self.corrections[view.capture].penalty(view.frame)
-        d = posed.deformation
-        if d is None:
-            return loss
-        loss = loss + w.laplacian * laplacian_loss(d.maps)
-        loss = loss + w.deformation * relative_deformation_loss(d.moved, d.neutral)
-        every = self.preset.rotation_every
-        if self.step % every:
-            return loss
-        turning = rotation_term(posed.surface, d.moved, d.neutral, self.faces)
-        return loss + every * w.rotation * turning
+        if posed.deformation is not None:
+            for term in self._deformation_terms(posed.surface, posed.deformation):
+                loss = loss + term
+        return loss
+
+    def _deformation_terms(self, surface: torch.Tensor, d: Deformation) -> Iterator[torch.Tensor]:
+        """What the network pays in this step (fact 35)."""
+        w, every = self.preset.weights, self.preset.rotation_every
+        if w.measures == "released":
+            yield w.laplacian * laplacian_loss(self.model.moving_map(d)[None])
+            riders = (self.model.riding(surface + x)[0] for x in (d.moved, d.neutral))
+            yield w.deformation * relative_deformation_loss(*riders)
+        else:
+            yield w.laplacian * laplacian_loss(d.maps)
+            yield w.deformation * relative_deformation_loss(d.moved, d.neutral)
+        if self.step % every == 0:
+            yield every * w.rotation * rotation_term(surface, d.moved, d.neutral, self.faces)
 
     def _photometric(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """The mixture of L1 and SSIM, less and less of it as the perceptual distance comes in (fact 33)."""
@@ -167,7 +186,7 @@ class Trainer:
 
     def _refine(self) -> None:
         d = self.preset.densify
-        if d.start <= self.step <= d.stop and self.step % d.every == 0:
+        if d.grows_at(self.step):
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
             densify(
                 self.rows,
@@ -223,7 +242,12 @@ class Trainer:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Takes up a `state`. Its sizes must be those of this trainer but for the number of Gaussians."""
+        """Takes up a `state`. Its sizes must be those of this trainer but for the number of Gaussians.
+
+        Raises:
+            ValueError, KeyError, RuntimeError: They are not. The trainer is of no use then.
+        """
+        self._check_rows(state)
         self.step = state["step"]
         for name, value in state["gaussians"].items():
             self.model.gaussians[name] = nn.Parameter(value.to(self.device))
@@ -238,6 +262,17 @@ class Trainer:
         self.evidence.gradient, self.evidence.seen, self.evidence.radius = (
             x.to(self.device) for x in state["evidence"]
         )
+
+    def _check_rows(self, state: dict[str, Any]) -> None:
+        """That every Gaussian has all its values and a triangle there is."""
+        binding = state["binding"]
+        n, triangles = len(binding), len(self.faces)
+        if binding.dtype != torch.int32 or n == 0 or not 0 <= binding.min() <= binding.max() < triangles:
+            raise ValueError(f"binding: expected int32[N] below {triangles}")
+        rows = {name: (n, *value.shape[1:]) for name, value in self.model.gaussians.items()}
+        found = {name: tuple(state["gaussians"][name].shape) for name in rows}
+        if found != rows or any(x.shape != (n,) for x in state["evidence"]):
+            raise ValueError(f"gaussians: expected {rows}, got {found}")
 
 
 def rotation_term(

@@ -69,7 +69,7 @@ def load_views(captures: Sequence[Capture], image_size: int) -> list[list[FitVie
 def _load_view(index: int, capture: Capture, view: View, image_size: int) -> FitView:
     camera = capture.head_camera(view)
     scale = min(1.0, image_size / max(camera.width, camera.height))
-    width, height = round(camera.width * scale), round(camera.height * scale)
+    width, height = (max(1, round(side * scale)) for side in (camera.width, camera.height))
     pixels = shrink(capture.image(view), width, height)
     matte = capture.matte(view)
     coverage = None if matte is None else shrink(matte[..., None], width, height)[..., 0].half()

@@ -14,7 +14,7 @@ two. Colours that depend on the direction turn with the head, and are right for 
 
 def add(kinds) -> argparse.ArgumentParser:
     """Adds the kind to those of `cap4d import`, which gives it `-o`."""
-    files = "point_cloud.ply --params flame_param.npz --flame flame2023.pkl"
+    files = "point_cloud.ply --flame flame2023.pkl"
     parser = command(
         kinds,
         "gaussian-avatars",
@@ -25,7 +25,10 @@ def add(kinds) -> argparse.ArgumentParser:
     )
     parser.add_argument("ply", type=Path, metavar="POINT_CLOUD.ply", help="Gaussians bound to triangles")
     parser.add_argument(
-        "--params", type=Path, required=True, metavar="FLAME_PARAM.npz", help="the file beside the Gaussians"
+        "--params",
+        type=Path,
+        metavar="FLAME_PARAM.npz",
+        help="the person and the sequence (default: flame_param.npz beside the Gaussians)",
     )
     parser.add_argument(
         "--flame", type=Path, required=True, metavar="MODEL.pkl", help="FLAME 2020 or 2023, with a jaw"

@@ -41,9 +41,9 @@ def add(commands) -> None:
 
 
 def run_synth(arguments: argparse.Namespace) -> None:
+    from cap4d.capture.folder import check_new_folder
     from cap4d.rig.store import load_rig
     from cap4d.synth.capture import check_sizes, synthesize
-    from cap4d.synth.folder import check_new_folder
 
     sizes = {
         name: getattr(arguments, name)

@@ -28,10 +28,10 @@ def add(commands) -> None:
 
 
 def run_track(arguments: argparse.Namespace) -> None:
+    from cap4d.capture.folder import check_new_folder
     from cap4d.rig.store import load_rig
     from cap4d.track import track
     from cap4d.track.footage import open_footage
-    from cap4d.track.tracker import check_new_folder
 
     check_new_folder(arguments.output)
     open_footage(arguments.input)

@@ -108,7 +108,7 @@ def bundle_of(
     )
     if model.deformer is None or not tiers:
         return bundle
-    bundle = with_tiers(bundle, [clip])
+    bundle = with_tiers(bundle, [] if clip is idle else [clip])
     return replace(bundle, tier_errors={"full": float32_error(bundle, model, clip), **bundle.tier_errors})
 
 

@@ -39,7 +39,9 @@ def distill(bundle: Bundle, network: Network, own: OwnExpressions) -> np.ndarray
         own: What to learn from; see `own_expressions`.
     """
     kinds = (own.frames, own.jittered, own.singles)
-    lines = _chosen([(kind.expr, unskinned_answers(bundle, network, kind)) for kind in kinds])
+    ends = np.cumsum([len(kind) for kind in kinds])[:-1]
+    found = np.split(unskinned_answers(bundle, network, own.all()), ends)
+    lines = _chosen([(kind.expr, answer) for kind, answer in zip(kinds, found, strict=True)])
     linear = np.zeros((bundle.n_expressions, len(bundle.grid), 3), np.float32)
     linear[:, bundle.grid.deformable] = lines.reshape(bundle.n_expressions, -1, 3)
     return linear

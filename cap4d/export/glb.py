@@ -1,6 +1,6 @@
 """Gaussians as a .glb with glTF's ratified extension KHR_gaussian_splatting; all float32, nothing is lost.
 
-glTF's axes: y up, the front to +z. What does not know the extension shows points.
+glTF's axes: y up, the front to +z. What does not know the extension shows points, coloured (`COLOR_0`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from cap4d.color import linear_from_srgb
 from cap4d.export.axes import unit_quats, y_up
 from cap4d.gaussians import Gaussians
+from cap4d.harmonics import SH_0
 
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, POINTS, VERTICES = 5126, 0, 34962  # glTF's numbers for them
@@ -31,17 +33,24 @@ def glb_bytes(gaussians: Gaussians) -> bytes:
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """float32[N, 1 | 3 | 4] by the names of the extension."""
+    """float32[N, 1 | 3 | 4] by the names of the extension, and the points' colours."""
     arrays = {
         "POSITION": gaussians.means,
         f"{EXTENSION}:ROTATION": np.roll(unit_quats(gaussians), -1, 1),  # xyzw
         f"{EXTENSION}:SCALE": gaussians.scales,
         f"{EXTENSION}:OPACITY": np.clip(gaussians.opacities, 0, 1)[:, None],
+        "COLOR_0": _colors(gaussians),
     }
     for degree in range(gaussians.sh_degree + 1):
         for order in range(2 * degree + 1):
             arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = gaussians.sh[:, degree**2 + order]
     return {name: np.ascontiguousarray(array, "<f4") for name, array in arrays.items()}
+
+
+def _colors(gaussians: Gaussians) -> np.ndarray:
+    """[N, 4]: linear light, as glTF has it, of no direction in particular; opacity."""
+    rgb = linear_from_srgb(np.clip(0.5 + SH_0 * gaussians.sh[:, 0].astype(np.float64), 0, 1))
+    return np.concatenate([rgb, np.clip(gaussians.opacities, 0, 1)[:, None]], 1)
 
 
 def _document(attributes: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import numpy as np
 
 from cap4d.export.axes import unit_quats
 from cap4d.gaussians import Gaussians
+from cap4d.harmonics import SH_0
 
-SH_0 = 0.28209479177387814
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 

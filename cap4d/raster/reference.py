@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cap4d.camera import NEAR, Camera
+from cap4d.harmonics import sh_basis
 from cap4d.raster.rasterize import Rasterized, collecting_leaf
 from cap4d.rotation import quat_to_rotmat
 
@@ -163,33 +164,6 @@ def eval_sh(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
     """
     basis = sh_basis(directions / directions.norm(dim=1, keepdim=True), degree)
     return (basis[..., None] * sh[:, : (degree + 1) ** 2]).sum(1) + 0.5
-
-
-def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """[V, (degree + 1)^2] real spherical harmonics of unit directions [V, 3], order and signs of 3DGS."""
-    x, y, z = directions.unbind(1)
-    xx, yy, zz = x * x, y * y, z * z
-    bands = [
-        [0.28209479177387814 * torch.ones_like(x)],
-        [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x],
-        [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-        ],
-        [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ],
-    ]
-    return torch.stack([b for band in bands[: degree + 1] for b in band], 1)
 
 
 def pixel_alphas(

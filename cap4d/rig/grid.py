@@ -56,6 +56,13 @@ class UvGrid:
         """Whether it is the rig's own triangles, without pixels."""
         return self.size == 0
 
+    @property
+    def valid(self) -> np.ndarray:
+        """bool[S, S]: the pixels that lie on the surface."""
+        valid = np.zeros((self.size, self.size), bool)
+        valid[self.pixels[:, 0], self.pixels[:, 1]] = True
+        return valid
+
     def to_map(self, values: Array) -> Array:
         """[..., G, C] values of the grid vertices -> [..., C, S, S] image, zero off the surface."""
         xp = namespace(values)

@@ -10,14 +10,17 @@ from __future__ import annotations
 import math
 import pickle
 import re
+import struct
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
 from cap4d.errors import DataError
 
 MAX_BYTES = 1 << 30
+MAX_AXES = 8
 
 
 def read_pickle(path: Path) -> dict[str, Any]:
@@ -28,11 +31,15 @@ def read_pickle(path: Path) -> dict[str, Any]:
         DataError: Naming the class or what else is wrong.
     """
     path = Path(path)
+
+    def refuse(name: str) -> DataError:
+        return DataError(path, "pickle", expected="NumPy, SciPy or chumpy arrays only", found=name)
+
     try:
         if path.stat().st_size > MAX_BYTES:
             raise DataError(path, "size", expected=f"at most {MAX_BYTES} bytes", found=path.stat().st_size)
         with open(path, "rb") as stream:
-            content = _Unpickler(stream, path).load()
+            content = RecordUnpickler(stream, encoding="latin1", names=_NAMES, refuse=refuse).load()
     except OSError as error:
         raise DataError(path, "file", expected="a pickle", found=error.strerror) from error
     except _BROKEN as error:
@@ -40,6 +47,76 @@ def read_pickle(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise DataError(path, "pickle", expected="a dictionary with text keys", found=type(content).__name__)
     return {key: _plain(path, key, value) for key, value in content.items()}
+
+
+class Tuple(tuple):
+    """A tuple that is no key. Hashing tuples that share tuples takes twice as long a level."""
+
+    __slots__ = ()
+    __hash__ = None
+
+
+Tuple.__name__ = "tuple"  # as messages call it
+
+
+class Inert:
+    """Nothing that a pickle is given can be given a state: it may be there for the next pickle, too."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        raise TypeError("a state for what has none")
+
+
+class Call(Inert):
+    """Something that a pickle may call: a function of ours."""
+
+    __slots__ = ("_make",)
+
+    def __init__(self, make: Callable) -> None:
+        self._make = make
+
+    def __call__(self, *args: Any) -> Any:
+        return self._make(*args)
+
+
+def _with_tuple(load: Callable) -> Callable:
+    """An operation that leaves a tuple on top of the stack, with ours in its place."""
+
+    def loaded(unpickler: RecordUnpickler) -> None:
+        load(unpickler)
+        unpickler.stack[-1] = Tuple(unpickler.stack[-1])
+
+    return loaded
+
+
+_TUPLES = (pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)
+
+
+class RecordUnpickler(pickle._Unpickler):
+    """Python's own in Python, not in C: that one makes its memo as long as the largest number that a file
+    names, so that five bytes take gigabytes. Files are small in operations: their arrays are one each.
+
+    Args:
+        names: What a pickle may name, and what stands for it.
+        refuse: Makes the error for another name.
+    """
+
+    dispatch: ClassVar = pickle._Unpickler.dispatch | {
+        code[0]: _with_tuple(pickle._Unpickler.dispatch[code[0]]) for code in _TUPLES
+    }
+
+    def __init__(
+        self, stream: BinaryIO, *, encoding: str, names: dict[str, Any], refuse: Callable[[str], Exception]
+    ) -> None:
+        super().__init__(stream, encoding=encoding)
+        self._names, self._refuse = names, refuse
+
+    def find_class(self, module: str, name: str) -> Any:
+        full_name = f"{module}.{name}"
+        if full_name not in self._names:
+            raise self._refuse(full_name[:120])
+        return self._names[full_name]
 
 
 class _Record:
@@ -103,19 +180,19 @@ def _reconstruct(kind: type, *_: Any) -> _Record:
 NUMPY_NAMES: dict[str, Any] = {
     "numpy.dtype": _Dtype,
     "numpy.ndarray": _Array,
-    "numpy.core.multiarray._reconstruct": _reconstruct,
-    "numpy._core.multiarray._reconstruct": _reconstruct,
+    "numpy.core.multiarray._reconstruct": Call(_reconstruct),
+    "numpy._core.multiarray._reconstruct": Call(_reconstruct),
     "numpy.core.multiarray.scalar": _Scalar,
     "numpy._core.multiarray.scalar": _Scalar,
-    "_codecs.encode": _encode,
-    "__builtin__.bytes": _no_bytes,
-    "builtins.bytes": _no_bytes,
+    "_codecs.encode": Call(_encode),
+    "__builtin__.bytes": Call(_no_bytes),
+    "builtins.bytes": Call(_no_bytes),
 }
 """What a pickle may name for arrays and numbers of NumPy's."""
 
 _NAMES: dict[str, Any] = NUMPY_NAMES | {
-    "copy_reg._reconstructor": _reconstruct,
-    "copyreg._reconstructor": _reconstruct,
+    "copy_reg._reconstructor": Call(_reconstruct),
+    "copyreg._reconstructor": Call(_reconstruct),
     "__builtin__.object": _Record,
     "builtins.object": _Record,
     "__builtin__.set": _Record,
@@ -137,21 +214,8 @@ _BROKEN = (
     RecursionError,
     TypeError,
     ValueError,
+    struct.error,
 )
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, stream, path: Path) -> None:
-        super().__init__(stream, encoding="latin1")
-        self._path = path
-
-    def find_class(self, module: str, name: str) -> Any:
-        full_name = f"{module}.{name}"
-        if full_name not in _NAMES:
-            raise DataError(
-                self._path, "pickle", expected="NumPy, SciPy or chumpy arrays only", found=full_name
-            )
-        return _NAMES[full_name]
 
 
 def numpy_value(path: Path, key: str, record: NumpyRecord) -> np.ndarray:
@@ -193,6 +257,8 @@ def _array(record: _Array) -> np.ndarray:
     _, shape, dtype, fortran, data = record.state
     data = data.encode("latin1") if isinstance(data, str) else data
     element = _element(dtype)
+    if not isinstance(shape, tuple) or len(shape) > MAX_AXES or not all(type(n) is int for n in shape):
+        raise ValueError("a shape of other than some whole numbers")
     if (
         not isinstance(data, bytes)
         or math.prod(shape) * element.itemsize != len(data)
@@ -204,9 +270,11 @@ def _array(record: _Array) -> np.ndarray:
 
 def _element(record: _Dtype) -> np.dtype:
     """A number type; NumPy's state of it begins with (version, byte order)."""
-    code, order = str(record.args[0]), str(record.state[1])
+    code, order = record.args[0], record.state[1]
+    if not (isinstance(code, str) and isinstance(order, str)):
+        raise TypeError("elements of a type without a name")
     if not re.fullmatch(r"[fiu][1248]|b1", code) or order not in ("<", ">", "|", "="):
-        raise ValueError(f"elements of type {order}{code}")
+        raise ValueError(f"elements of type {order[:8]}{code[:8]}")
     return np.dtype(order + code)
 
 

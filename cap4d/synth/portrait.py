@@ -9,6 +9,7 @@ import numpy as np
 
 from cap4d import _core
 from cap4d.camera import Camera, opencv_from_rig
+from cap4d.color import linear_from_srgb
 from cap4d.mesh import rasterize_mesh, vertex_normals
 from cap4d.rig.head import HeadRig, Subject
 from cap4d.synth.atlas import KINDS, build_atlas, kinds_of_vertices
@@ -79,7 +80,7 @@ def draw_person(rig: HeadRig, identity: int, *, texels: int = 1024) -> Person:
     shape = shape.astype(np.float32)
     subject, lights = rig.subject(shape), draw_lights(light)
     hair = grow_hair(rig, subject.neutral, seed=identity)
-    look = draw_complexion(looks, linear(np.asarray(hair.color, np.float64)))
+    look = draw_complexion(looks, linear_from_srgb(np.asarray(hair.color, np.float64)))
     return Person(
         rig=rig,
         shape=shape,
@@ -147,11 +148,6 @@ def develop(samples: Samples, supersample: int) -> tuple[np.ndarray, np.ndarray]
     matte = samples.alpha.reshape(boxes).mean((1, 3))
     linear = samples.rgb.reshape(*boxes, 3).mean((1, 3)) / np.maximum(matte, 1e-6)[..., None]
     return np.where(matte[..., None] > 0, srgb(linear), 1), matte
-
-
-def linear(srgb: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] to linear light."""
-    return np.where(srgb < 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from cap4d.camera import Camera, head_fixed, look_at, opencv_from_rig
+from cap4d.capture.folder import check_new_folder, new_folder
 from cap4d.capture.image import write_image
 from cap4d.rig.head import HeadRig
 from cap4d.synth.body import draw_body
 from cap4d.synth.capture import Performance, perform, save_performance
-from cap4d.synth.folder import check_new_folder, new_folder
 from cap4d.synth.portrait import Person, Pose, draw_person, picture, pose_person
 from cap4d.track.progress import progress
 

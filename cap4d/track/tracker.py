@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import logging
-import shutil
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,8 +11,9 @@ import numpy as np
 
 from cap4d.camera import Camera
 from cap4d.capture.capture import Capture, save_capture
+from cap4d.capture.folder import check_new_folder, new_folder
 from cap4d.capture.image import read_image, write_image
-from cap4d.errors import ArgumentError, DataError
+from cap4d.errors import DataError
 from cap4d.rig.head import HeadRig
 from cap4d.track.correspondence import find_correspondence
 from cap4d.track.dense import refine
@@ -68,7 +65,7 @@ def track(source: str | Path, rig: HeadRig, output: str | Path, *, overlay: bool
     start = time.monotonic()
     check_new_folder(Path(output))
     footage = open_footage(source)
-    with _new_folder(Path(output)) as folder:
+    with new_folder(Path(output)) as folder:
         observations = _look(footage, folder)
         log.info("%s: a face in %d of %d frames", source, observations.valid.sum(), len(observations.valid))
         with without_native_chatter():
@@ -100,26 +97,6 @@ def track(source: str | Path, rig: HeadRig, output: str | Path, *, overlay: bool
         *(output, report.tracked, report.frames, report.median_error, report.p95_error, report.seconds),
     )
     return report
-
-
-def check_new_folder(output: Path) -> None:
-    """Raises ArgumentError unless a capture can go there: the parent exists; it is empty or not there."""
-    if output.exists() and not (output.is_dir() and not any(output.iterdir())):
-        raise ArgumentError(f"output: {output} exists already; choose another folder or remove it")
-    if not output.parent.is_dir():
-        raise ArgumentError(f"output: the folder of {output} does not exist")
-
-
-@contextmanager
-def _new_folder(output: Path) -> Iterator[Path]:
-    """A temporary folder beside `output` that takes its place when all went well, and is gone otherwise."""
-    folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
-    try:
-        yield folder
-        folder.chmod(0o755)
-        folder.replace(output)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _look(footage: Footage, folder: Path) -> Observations:

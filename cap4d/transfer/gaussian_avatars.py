@@ -22,6 +22,7 @@ from cap4d.bundle.writer import write_bundle
 from cap4d.camera import Camera, opencv_from_rig, orbit_camera
 from cap4d.drive.clip import Clip
 from cap4d.errors import ArgumentError, DataError
+from cap4d.harmonics import rotate_sh
 from cap4d.player.avatar import Avatar
 from cap4d.player.png import encode_png
 from cap4d.rig.flame import (
@@ -46,11 +47,11 @@ from cap4d.transfer.flame_chain import (
 )
 from cap4d.transfer.flame_teeth import with_teeth
 from cap4d.transfer.gaussian_ply import BoundGaussians, read_gaussian_ply
-from cap4d.transfer.harmonics import turned_harmonics
 
 log = logging.getLogger(__name__)
 
 LICENCE = "LicenseRef-FLAME"
+PARAMS = "flame_param.npz"
 FPS = 25.0  # the files say none
 MIN_FPS, MAX_FPS = 0.1, 1000.0  # of an idle clip
 USEFUL = (-3.0, 3.0)  # standard deviations of FLAME's expressions
@@ -97,12 +98,14 @@ class FlameSequence:
     translation: np.ndarray
 
 
-def import_gaussian_avatars(ply: Path, output: Path, *, params: Path, flame: Path, fps: float = FPS) -> None:
+def import_gaussian_avatars(
+    ply: Path, output: Path, *, flame: Path, params: Path | None = None, fps: float = FPS
+) -> None:
     """Writes `output`, a `.cap4d` file.
 
     Args:
         ply: `point_cloud.ply`.
-        params: `flame_param.npz` beside it.
+        params: `flame_param.npz`; None: that beside it.
         flame: FLAME 2020 or 2023 with a jaw, the pickle that the avatar was fitted with.
         fps: Of the sequence.
     Raises:
@@ -111,6 +114,7 @@ def import_gaussian_avatars(ply: Path, output: Path, *, params: Path, flame: Pat
     """
     if not MIN_FPS <= fps <= MAX_FPS:
         raise ArgumentError(f"fps: expected {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}")
+    params = ply.with_name(PARAMS) if params is None else params
     model = with_teeth(read_edition(flame))
     sequence = read_sequence(params, vertices=len(model.template))
     gaussians = read_gaussian_ply(ply, faces=len(model.faces))
@@ -192,7 +196,7 @@ def make_bundle(
         quats=gaussians.quats,
         log_scales=gaussians.log_scales,
         opacity_logits=gaussians.opacity_logits,
-        sh=turned_harmonics(gaussians.sh, opencv_from_rig(pose[0])),
+        sh=rotate_sh(gaussians.sh, opencv_from_rig(pose[0]).T),  # from the world to the head
         binding=gaussians.binding,
         camera=_front_view(flame, subject),
         idle=_clip(sequence, motion, pose, name=name, fps=fps),

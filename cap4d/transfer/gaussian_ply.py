@@ -12,12 +12,20 @@ from typing import BinaryIO
 
 import numpy as np
 
-from cap4d.bundle.schema import COUNTS, GAUSSIANS, TENSORS
+from cap4d.bundle.schema import COUNTS
 from cap4d.errors import DataError
 from cap4d.gaussians import SH_COUNTS
+from cap4d.transfer.raw_gaussians import check_gaussians
 
 MAX_HEADER_BYTES, MAX_PROPERTIES = 1 << 16, 256
-SMALLEST_NORM = 1e-6  # of a quaternion
+CHECKED = {
+    "x to z": "means",
+    "rot_0 to rot_3": "quats",
+    "scale_0 to scale_2": "log_scales",
+    "opacity": "opacity_logits",
+    "f_dc_*, f_rest_*": "sh",
+}
+"""Properties -> a bundle's tensor."""
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"},
@@ -60,15 +68,7 @@ def read_gaussian_ply(path: Path, *, faces: int) -> BoundGaussians:
         sh=_harmonics(columns),
         binding=_binding(columns, faces),
     )
-    norms = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
-    if norms.min() < SMALLEST_NORM:
-        expected = f"quaternions with norms of at least {SMALLEST_NORM:g}"
-        raise DataError(path, "rot_0 to rot_3", expected=expected, found=norms.min())
-    for name, spec in TENSORS[GAUSSIANS].items():
-        value = getattr(gaussians, name)
-        if spec.kind == "packed" and (value.min() < spec.low or value.max() > spec.high):
-            worst = value.min() if value.min() < spec.low else value.max()
-            raise DataError(path, name, expected=f"numbers in [{spec.low:g}, {spec.high:g}]", found=worst)
+    check_gaussians(path, {field: (name, getattr(gaussians, name)) for field, name in CHECKED.items()})
     return gaussians
 
 

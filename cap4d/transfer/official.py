@@ -17,7 +17,7 @@ import torch
 
 from cap4d.avatar.deformer import ENCODING_CHANNELS, Deformer
 from cap4d.avatar.model import AvatarModel
-from cap4d.bundle.schema import COUNTS, GAUSSIANS, TENSORS
+from cap4d.bundle.schema import COUNTS
 from cap4d.bundle.writer import write_bundle
 from cap4d.camera import Camera, head_fixed
 from cap4d.drive.clip import Clip
@@ -32,6 +32,7 @@ from cap4d.rig.grid import UvGrid, build_grid, remesh
 from cap4d.rig.head import HeadRig
 from cap4d.rig.npz import checked_float32, checked_indices, read_npz
 from cap4d.synth.idle import idle_clip as invented_clip
+from cap4d.transfer.raw_gaussians import check_gaussians
 from cap4d.transfer.torch_file import TensorRecord, TorchFile
 
 log = logging.getLogger(__name__)
@@ -41,10 +42,19 @@ KEYS = ("shape", "base_rot", "deform_net", "gaussians")
 N_GAUSSIAN_FIELDS = 14
 N_FACES = 28_120  # of the released grid (fact 18)
 MAX_WIDTH = 256
+MAX_NETWORK_VALUES = 1 << 29  # of the widest, with room
 DEFAULT_SIZE, DEFAULT_DISTANCE = 512, 1.469153  # px and m of the released sample sequences (fact 47)
 DEFAULT_CENTRE = 257.3, 269.5  # px, the same
 DEFAULT_FOCAL = 2200.0  # px; theirs is 2605, which cuts hair
-SMALLEST_NORM = 1e-6  # of a quaternion
+CHECKED = {
+    "_xyz": ("means", "means"),
+    "_rotation": ("quats", "quats"),
+    "_scaling": ("log_scales", "log_scales"),
+    "_opacity": ("opacity_logits", "opacity_logits"),
+    "_features_dc": ("sh", "sh_dc"),
+    "_features_rest": ("sh", "sh_rest"),
+}
+"""Their names -> a bundle's tensor, and ours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,9 +179,7 @@ def avatar_model(official: OfficialAvatar, rig: HeadRig, grid: UvGrid, *, source
     Raises:
         DataError: Its network has other layers than the released one (fact 22).
     """
-    valid = np.zeros((grid.size, grid.size), bool)
-    valid[grid.pixels[:, 0], grid.pixels[:, 1]] = True
-    deformer = Deformer(valid, width=official.width)
+    deformer = Deformer(grid.valid, width=official.width)
     _check_layers(source, official.network, deformer)
     deformer.load_state_dict({name: torch.from_numpy(value) for name, value in official.network.items()})
     gaussians = {name: torch.from_numpy(value) for name, value in official.gaussians.items()}
@@ -255,7 +263,7 @@ def _gaussians(
         "sh_dc": _floats(file, "_features_dc", dc, (n, 1, 3)),
         "sh_rest": _harmonics(file, rest, degree, n),
     }
-    _check_values(file.path, gaussians)
+    check_gaussians(file.path, {field: (name, gaussians[key]) for field, (name, key) in CHECKED.items()})
     bound = _indices(file, "binding", binding, (n,), below=faces)
     counts = _indices(file, "binding_counter", counter, (faces,), below=n + 1)
     if not np.array_equal(counts, np.bincount(bound, minlength=faces)):
@@ -271,29 +279,9 @@ def _harmonics(file: TorchFile, rest: Any, degree: Any, n: int) -> np.ndarray:
         expected = "harmonics of a degree up to 3"
         raise DataError(file.path, "_features_rest", expected=expected, found=list(values.shape))
     if type(degree) is not int or not 0 <= degree <= SH_COUNTS[count]:
-        expected, found = f"0 to {SH_COUNTS[count]}", str(degree)[:40]
+        expected, found = f"0 to {SH_COUNTS[count]}", degree if _is_short(degree) else _kind(degree)
         raise DataError(file.path, "active_sh_degree", expected=expected, found=found)
     return np.ascontiguousarray(values[:, : (degree + 1) ** 2 - 1])
-
-
-def _check_values(path: Path, gaussians: dict[str, np.ndarray]) -> None:
-    """Refuses what no bundle may hold."""
-    released = {
-        "means": "_xyz",
-        "log_scales": "_scaling",
-        "opacity_logits": "_opacity",
-        "sh_dc": "_features_dc",
-        "sh_rest": "_features_rest",
-    }
-    for name, field in released.items():
-        spec, value = TENSORS[GAUSSIANS]["sh" if name.startswith("sh_") else name], gaussians[name]
-        if value.size and (value.min() < spec.low or value.max() > spec.high):
-            worst = value.min() if value.min() < spec.low else value.max()
-            raise DataError(path, field, expected=f"numbers in [{spec.low:g}, {spec.high:g}]", found=worst)
-    norms = np.linalg.norm(gaussians["quats"], axis=1)
-    if norms.min() < SMALLEST_NORM:
-        expected = f"norms of at least {SMALLEST_NORM:g}"
-        raise DataError(path, "_rotation", expected=expected, found=norms.min())
 
 
 def _network(file: TorchFile, state: Any) -> dict[str, np.ndarray]:
@@ -305,6 +293,10 @@ def _network(file: TorchFile, state: Any) -> dict[str, np.ndarray]:
     if len(shape) != 4 or not 1 <= shape[0] <= MAX_WIDTH or shape[1:] != (3 + ENCODING_CHANNELS, 4, 4):
         expected, found = f"[1 to {MAX_WIDTH}, {3 + ENCODING_CHANNELS}, 4, 4]", list(shape) or "nothing"
         raise DataError(file.path, f"deform_net {first}", expected=expected, found=found)
+    size = sum(value.count for value in state.values() if isinstance(value, TensorRecord))
+    if size > MAX_NETWORK_VALUES:  # many tensors may be of one storage
+        expected = f"at most {MAX_NETWORK_VALUES} numbers"
+        raise DataError(file.path, "deform_net", expected=expected, found=size)
     return {
         name: _floats(file, f"deform_net {name[:80]}", value, (None,) * len(getattr(value, "shape", (0,))))
         for name, value in state.items()
@@ -343,6 +335,11 @@ def _check_shape(path: Path, field: str, value: Any, shape: tuple[int | None, ..
     if not fits or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
         expected = f"[{', '.join('*' if n is None else str(n) for n in shape)}]"
         raise DataError(path, field, expected=expected, found=list(value.shape))
+
+
+def _is_short(value: Any) -> bool:
+    """Whether it is a number that can be shown. What holds itself many times over takes for ever to print."""
+    return type(value) is int and abs(value) < 1 << 32
 
 
 def _kind(value: Any) -> str:

@@ -10,17 +10,27 @@ from __future__ import annotations
 
 import math
 import pickle
+import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from cap4d.errors import DataError
-from cap4d.rig.unpickle import NUMPY_NAMES, NumpyRecord, numpy_value
+from cap4d.rig.unpickle import (
+    MAX_AXES,
+    NUMPY_NAMES,
+    Call,
+    Inert,
+    NumpyRecord,
+    RecordUnpickler,
+    Tuple,
+    numpy_value,
+)
 
 MAX_BYTES = 1 << 33
 MAX_PICKLE_BYTES = 1 << 24  # a checkpoint's is some kilobytes
@@ -38,7 +48,7 @@ STORAGES = {
 _BROKEN = (
     *(OSError, ValueError, EOFError, LookupError, TypeError, AttributeError, NotImplementedError),
     *(RuntimeError, MemoryError, ArithmeticError, zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error),
-    *(pickle.UnpicklingError, ImportError),
+    *(pickle.UnpicklingError, ImportError, RecursionError, struct.error),
 )
 
 
@@ -121,9 +131,14 @@ class TorchFile:
 
     def _load(self) -> Any:
         data = self._read("data.pkl", limit=MAX_PICKLE_BYTES)
+
+        def refuse(name: str) -> DataError:
+            expected = "tensors and plain containers only"
+            return DataError(self.path, "data.pkl", expected=expected, found=name)
+
         try:
-            return _Unpickler(data, self.path).load()
-        except (*_BROKEN, RecursionError) as error:
+            return _Unpickler(BytesIO(data), encoding="utf-8", names=_NAMES, refuse=refuse).load()
+        except _BROKEN as error:
             raise self._broken("data.pkl", "tensors and plain containers", error) from error
 
     def _storage(self, field: str, record: StorageRecord) -> np.ndarray:
@@ -156,7 +171,7 @@ class TorchFile:
 
 
 @dataclass(frozen=True)
-class StorageRecord:
+class StorageRecord(Inert):
     """What a pickle says of a storage: a key of `STORAGES`, its number, and how many values it holds."""
 
     kind: str
@@ -165,13 +180,20 @@ class StorageRecord:
 
 
 @dataclass(frozen=True)
-class TensorRecord:
-    """A tensor as a pickle has it: a view of a storage; `stride` and `offset` in values."""
+class TensorRecord(Inert):
+    """A tensor as a pickle has it: a view of a storage; `stride` and `offset` in values. Of at most
+    `MAX_AXES` axes, and no number is below 0 or above `MAX_VALUES`.
+    """
 
     storage: StorageRecord
     offset: int
     shape: tuple[int, ...]
     stride: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """Of its values."""
+        return math.prod(self.shape)
 
 
 class _Dict(dict):
@@ -181,31 +203,20 @@ class _Dict(dict):
         pass
 
 
-class _Call:
-    """Something that a pickle may call: a function of ours. Nothing can be set on it."""
-
-    __slots__ = ("_make",)
-
-    def __init__(self, make) -> None:
-        object.__setattr__(self, "_make", make)
-
-    def __call__(self, *args: Any) -> Any:
-        return self._make(*args)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise TypeError("a state for a function")
-
-    def __setstate__(self, state: Any) -> None:
-        raise TypeError("a state for a function")
-
-
 def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> TensorRecord:
     """torch._utils._rebuild_tensor_v2; gradients, hooks and metadata are left aside."""
     if not isinstance(storage, StorageRecord):
         raise TypeError("a tensor without a storage")
     if not (isinstance(shape, tuple) and isinstance(stride, tuple)):
         raise TypeError("a tensor whose sizes are no tuples")
-    return TensorRecord(storage, offset, shape, stride)
+    numbers = (*shape, *stride, offset)
+    if not len(shape) == len(stride) <= MAX_AXES or not all(_is_size(n) for n in numbers):
+        raise ValueError("a tensor with impossible sizes, strides or offset")
+    return TensorRecord(storage, offset, tuple(shape), tuple(stride))
+
+
+def _is_size(number: Any) -> bool:
+    return type(number) is int and 0 <= number <= MAX_VALUES
 
 
 def _parameter(data: Any, *_: Any) -> Any:
@@ -215,9 +226,9 @@ def _parameter(data: Any, *_: Any) -> Any:
     return data
 
 
-def _sizes(values: Any = ()) -> tuple:
+def _sizes(values: Any = ()) -> Tuple:
     """torch.Size"""
-    return tuple(values) if isinstance(values, (list, tuple)) else ()
+    return Tuple(values) if isinstance(values, (list, tuple)) else Tuple()
 
 
 def _set(values: Any = ()) -> list:
@@ -225,42 +236,46 @@ def _set(values: Any = ()) -> list:
 
 
 @dataclass(frozen=True)
-class _StorageKind:
+class _StorageKind(Inert):
     name: str
 
 
 _NAMES: dict[str, Any] = {
     "collections.OrderedDict": _Dict,
-    "collections.defaultdict": _Call(lambda *_: _Dict()),
-    "torch._utils._rebuild_tensor_v2": _Call(_tensor),
-    "torch._utils._rebuild_parameter": _Call(_parameter),
-    "torch._utils._rebuild_parameter_with_state": _Call(_parameter),
-    "torch.Size": _Call(_sizes),
-    "builtins.set": _Call(_set),
-    "__builtin__.set": _Call(_set),
+    "collections.defaultdict": Call(lambda *_: _Dict()),
+    "torch._utils._rebuild_tensor_v2": Call(_tensor),
+    "torch._utils._rebuild_parameter": Call(_parameter),
+    "torch._utils._rebuild_parameter_with_state": Call(_parameter),
+    "torch.Size": Call(_sizes),
+    "builtins.set": Call(_set),
+    "__builtin__.set": Call(_set),
     **{f"torch.{name}": _StorageKind(name) for name in STORAGES},
     **{f"torch.cuda.{name}": _StorageKind(name) for name in STORAGES},
     **NUMPY_NAMES,
 }
 
 
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, data: bytes, path: Path) -> None:
-        super().__init__(BytesIO(data), encoding="utf-8")
-        self._path = path
+_OPERATIONS = (
+    *(pickle.PROTO, pickle.FRAME, pickle.STOP, pickle.MARK, pickle.GLOBAL, pickle.STACK_GLOBAL),
+    *(pickle.REDUCE, pickle.BUILD, pickle.BINPERSID, pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE),
+    *(pickle.BININT, pickle.BININT1, pickle.BININT2, pickle.LONG1, pickle.BINFLOAT),
+    *(pickle.BINUNICODE, pickle.SHORT_BINUNICODE, pickle.BINBYTES, pickle.SHORT_BINBYTES),
+    *(pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3),
+    *(pickle.EMPTY_LIST, pickle.APPEND, pickle.APPENDS),
+    *(pickle.EMPTY_DICT, pickle.SETITEM, pickle.SETITEMS),
+    *(pickle.BINPUT, pickle.LONG_BINPUT, pickle.MEMOIZE, pickle.BINGET, pickle.LONG_BINGET),
+)
+"""All that `torch.save` writes for tensors and plain containers, of any protocol from 2 on."""
 
-    def find_class(self, module: str, name: str) -> Any:
-        full_name = f"{module}.{name}"
-        if full_name not in _NAMES:
-            expected = "tensors and plain containers only"
-            raise DataError(self._path, "data.pkl", expected=expected, found=full_name[:120])
-        return _NAMES[full_name]
+
+class _Unpickler(RecordUnpickler):
+    dispatch: ClassVar = {code[0]: RecordUnpickler.dispatch[code[0]] for code in _OPERATIONS}
 
     def persistent_load(self, pid: Any) -> StorageRecord:
         """("storage", kind, key, device, count); where the tensor was (`cuda:0`) does not matter."""
         word, kind, key, _, count = pid
         known = isinstance(kind, _StorageKind) and isinstance(key, str) and key.isascii() and key.isdigit()
-        if word != "storage" or not known or type(count) is not int or not 0 <= count <= MAX_VALUES:
+        if word != "storage" or not known or not _is_size(count):
             raise TypeError("a storage of another kind")
         return StorageRecord(kind.name, key, count)
 
@@ -272,10 +287,7 @@ def _view(storage: np.ndarray, record: TensorRecord) -> np.ndarray:
         ValueError: It reaches beyond the storage, or repeats it.
     """
     shape, stride, offset = record.shape, record.stride, record.offset
-    numbers = (*shape, *stride, offset)
-    if not all(type(n) is int and 0 <= n <= MAX_VALUES for n in numbers) or len(shape) != len(stride):
-        raise ValueError(f"sizes {shape}, strides {stride}, offset {offset}")
-    if len(shape) > 8 or math.prod(shape) > len(storage):
+    if record.count > len(storage):
         raise ValueError(f"sizes {shape} of {len(storage)} numbers")
     last = offset + sum((n - 1) * step for n, step in zip(shape, stride, strict=True))
     if 0 not in shape and last >= len(storage):

@@ -1,11 +1,12 @@
 """Fits that are killed, stopped or find their checkpoint spoiled end where they would have ended."""
 
 import logging
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,24 +15,28 @@ from tiny_avatar import GRID, tiny_rig, write_tiny_capture
 from cap4d.avatar.checkpoint import load_latest, previous_of, save_checkpoint
 from cap4d.avatar.fit import fit
 from cap4d.avatar.presets import Densify, preset_named
-from cap4d.errors import DataError
+from cap4d.errors import DataError, exit_code
 
-TESTS = Path(__file__).parents[1]
 KILLED_AFTER = (0.0, 0.13, 0.31)  # s since the first checkpoint: before, while and after others are written
-FIT = """
-import sys
-from pathlib import Path
-from test_fit_interrupted import slow_fit
-from cap4d.errors import exit_code
-import logging
-logging.basicConfig(level=logging.INFO, format="%(message)s")
-sys.exit(exit_code("cap4d", lambda: slow_fit(Path(sys.argv[1]), Path(sys.argv[2])) and 0))
-"""
+
+
+@pytest.fixture(scope="module")
+def nursery():
+    """Makes processes of their own that have torch already: it takes longer to load than such a fit."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["cap4d.avatar.fit", "cap4d.export.bundle"])
+    return context
+
+
+def fit_apart(capture: Path, output: Path, log: Path, threads: str) -> None:
+    """What a process does; its words go to `log`."""
+    os.environ["CAP4D_THREADS"] = threads
+    os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT), sys.stderr.fileno())
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr, force=True)
+    sys.exit(exit_code("cap4d", lambda: slow_fit(capture, output) and 0))
 
 
 def tiny_preset():
-    from dataclasses import replace
-
     return replace(
         preset_named("debug", "short"),
         iterations=90,
@@ -63,55 +68,63 @@ def whole(capture, tmp_path_factory):
     return output.read_bytes()
 
 
-def started(capture: Path, output: Path, threads: str) -> subprocess.Popen:
-    """A fit in a process of its own that has written a checkpoint."""
-    environment = {**os.environ, "PYTHONPATH": f"{TESTS}:{TESTS / 'e2e'}", "CAP4D_THREADS": threads}
-    process = subprocess.Popen(
-        [sys.executable, "-c", FIT, str(capture), str(output)], env=environment, stderr=subprocess.PIPE
-    )
-    deadline = time.monotonic() + 60
-    while not output.with_suffix(".fit.ckpt").exists():
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.005)
-    return process
+@pytest.fixture
+def started(nursery, capture, tmp_path):
+    """Starts a fit in a process of its own and waits until it has written a checkpoint."""
+    running = []
+
+    def start(output: Path, threads: str, until=lambda path: path):
+        arguments = (capture, output, tmp_path / "log" / "stderr", threads)
+        process = nursery.Process(target=fit_apart, args=arguments)
+        (tmp_path / "log").mkdir()
+        process.start()
+        running.append(process)
+        deadline = time.monotonic() + 60
+        while not until(output.with_suffix(".fit.ckpt")).exists():
+            assert process.is_alive() and time.monotonic() < deadline
+            time.sleep(0.002)
+        return process
+
+    yield start
+    for process in running:
+        process.kill()
+        process.join()
 
 
 @pytest.mark.parametrize("delay", KILLED_AFTER)
-def test_a_killed_fit_goes_on_to_the_same_bytes(capture, whole, tmp_path, delay):
+def test_a_killed_fit_goes_on_to_the_same_bytes(started, capture, whole, tmp_path, delay):
     """On two threads before the kill, and on as many as there are after it."""
     output = tmp_path / "x.cap4d"
-    process = started(capture, output, "2")
+    process = started(output, "2")
     time.sleep(delay)
     process.kill()
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     assert not output.exists()
     slow_fit(capture, output, resume=True)
     assert output.read_bytes() == whole
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.cap4d", "x.fit.json", "x.fit.png"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "x.cap4d", "x.fit.json", "x.fit.png"]
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(capture, whole, tmp_path):
+def test_ctrl_c_saves_and_says_how_to_go_on(started, capture, whole, tmp_path):
     output = tmp_path / "x.cap4d"
-    process = started(capture, output, "1")
-    process.send_signal(signal.SIGINT)
-    lines = process.communicate(timeout=60)[1].decode().splitlines()
-    assert process.returncode == 130
+    process = started(output, "1")
+    os.kill(process.pid, signal.SIGINT)
+    process.join(timeout=60)
+    assert process.exitcode == 130
+    lines = (tmp_path / "log" / "stderr").read_text().splitlines()
     assert sum("the same command with --resume goes on" in line for line in lines) == 1
     assert not any("Traceback" in line for line in lines)
     slow_fit(capture, output, resume=True)
     assert output.read_bytes() == whole
 
 
-def test_a_spoiled_checkpoint_costs_some_steps_and_not_the_fit(capture, whole, tmp_path, caplog):
+def test_a_spoiled_checkpoint_costs_some_steps_and_not_the_fit(started, capture, whole, tmp_path, caplog):
     output = tmp_path / "x.cap4d"
     checkpoint = output.with_suffix(".fit.ckpt")
-    process = started(capture, output, "1")
-    while not previous_of(checkpoint).exists():
-        assert process.poll() is None
-        time.sleep(0.005)
+    process = started(output, "1", until=previous_of)
     process.kill()
-    process.communicate()
+    process.join()
     if not checkpoint.exists():  # killed between the two renames
         checkpoint.write_bytes(previous_of(checkpoint).read_bytes())
     data = bytearray(checkpoint.read_bytes())

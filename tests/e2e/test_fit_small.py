@@ -1,14 +1,15 @@
 """A whole fit, small: a painted sheet that bulges and shears becomes an avatar file."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from tiny_avatar import GRID, tiny_rig, write_tiny_capture
 
-from cap4d.avatar import fit as fit_module
-from cap4d.avatar.checkpoint import save_checkpoint
+from cap4d.avatar import journal as journal_module
+from cap4d.avatar.checkpoint import remove_checkpoints, save_checkpoint
 from cap4d.avatar.fit import fit
 from cap4d.avatar.presets import PRESETS, Densify
 from cap4d.bundle import read_bundle
@@ -58,7 +59,7 @@ def test_the_report_is_written(fitted):
     assert written["nearest_frame_psnr"] == report.nearest_frame_psnr
     assert written["seconds"] > 0
     assert 0 < written["step_ms"] < 1e3 * written["seconds"]
-    assert written["device"] == "cpu"
+    assert (written["device"], written["recipe"], written["perceptual"]) == ("cpu", "short", "none")
     assert written["peak_memory_mb"] > 10
     assert sorted(p.suffix for p in output.parent.iterdir()) == [".cap4d", ".json", ".png"]
 
@@ -114,7 +115,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(capture, tmp_path
         if len(saved) == 2:  # after the first densification
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(fit_module, "save_checkpoint", save_then_interrupt)
+    monkeypatch.setattr(journal_module, "save_checkpoint", save_then_interrupt)
     output = tmp_path / "broken.cap4d"
     with pytest.raises(KeyboardInterrupt):
         fit([capture], tiny_rig(), output, preset=short)
@@ -130,8 +131,14 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(capture, tmp_path
 def test_a_checkpoint_of_another_fit_is_refused(capture, tmp_path):
     checkpoint = tmp_path / "x.fit.ckpt"
     save_checkpoint({"kind": "something else", "trainer": {}, "seconds": 0.0}, checkpoint)
-    with pytest.raises(DataError, match="kind: expected preset"):
+    with pytest.raises(DataError, match="kind: expected preset") as refused:
         fit([capture], tiny_rig(), tmp_path / "x.cap4d", preset=TINY, resume=True)
+    kind = re.search(r"kind: expected (.*), found", str(refused.value)).group(1)
+    for trainer in ({}, {"binding": 3}, "none"):
+        save_checkpoint({"kind": kind, "trainer": trainer, "seconds": 0.0}, checkpoint)
+        with pytest.raises(DataError, match="state: expected that of this fit"):
+            fit([capture], tiny_rig(), tmp_path / "x.cap4d", preset=TINY, resume=True)
+    remove_checkpoints(checkpoint)
     checkpoint.write_bytes(b"not a checkpoint")
     with pytest.raises(DataError, match="checkpoint: expected tensors"):
         fit([capture], tiny_rig(), tmp_path / "x.cap4d", preset=TINY, resume=True)
@@ -179,6 +186,8 @@ def test_captures_and_names_that_do_not_fit_are_refused(capture, tmp_path):
         fit([capture], replace(tiny_rig(), name="other"), output, preset=TINY)
     with pytest.raises(ArgumentError, match="preset: expected one of"):
         fit([capture], tiny_rig(), output, preset="huge")
+    with pytest.raises(ArgumentError, match="captures: expected at least one"):
+        fit([], tiny_rig(), output, preset=TINY)
     with pytest.raises(ArgumentError, match="ablate"):
         fit([capture], tiny_rig(), output, preset=TINY, ablate="everything")
     assert not list(tmp_path.iterdir())

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
-from tiny_bundle import tiny_bundle
+from tiny_bundle import tiny_bundle, tiny_bundle_on_mesh
+from x_server import needs_x, run
 
 from cap4d.bundle import write_bundle
-
-TESTS = Path(__file__).resolve().parents[1]
 
 PROGRAM = """
 import json, sys
@@ -62,27 +56,6 @@ json.dump(found, open("found.json", "w"))
 """
 
 
-needs_x = pytest.mark.skipif(
-    any(shutil.which(name) is None for name in ("xvfb-run", "xauth", "xdotool")),
-    reason="needs xvfb-run, xauth and xdotool (Debian: xvfb xauth xdotool)",
-)
-
-
-def run(program, folder, *, screen="1280x800x24"):
-    """What a program wrote to found.json under an X server of its own, and what it said on stderr."""
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS / "unit")]),
-        "LIBGL_ALWAYS_SOFTWARE": "1",
-        "XDG_CONFIG_HOME": str(folder / "config"),
-    }
-    words = ["xvfb-run", "-a", "-s", f"-screen 0 {screen}", sys.executable, "-c", program]
-    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=170)
-    if "window: expected OpenGL 4.1" in done.stderr:
-        pytest.skip("the X server has no OpenGL 4.1")
-    assert done.returncode == 0, done.stderr
-    return json.loads((folder / "found.json").read_text()), done.stderr
-
-
 @needs_x
 def test_a_real_pointer_and_keyboard_work_it(tmp_path):
     write_bundle(tiny_bundle(network=False), tmp_path / "tiny.cap4d")
@@ -120,9 +93,16 @@ json.dump(found, open("found.json", "w"))
 
 
 @needs_x
-@pytest.mark.parametrize("backend", ["cpu", pytest.param("gl", marks=pytest.mark.slow)])
-def test_panels_sizes_and_drops_while_it_records(tmp_path, backend):
-    write_bundle(tiny_bundle(), tmp_path / "tiny.cap4d")
+@pytest.mark.parametrize(
+    ("backend", "make"),
+    [
+        ("cpu", tiny_bundle),
+        ("cpu", tiny_bundle_on_mesh),
+        pytest.param("gl", tiny_bundle, marks=pytest.mark.slow),
+    ],
+)
+def test_panels_sizes_and_drops_while_it_records(tmp_path, backend, make):
+    write_bundle(make(), tmp_path / "tiny.cap4d")
     found, said = run(SOAK.replace("BACKEND", repr(backend)), tmp_path, screen="4096x2304x24")
     assert said == ""
     assert found["shape"] == [760, 1180, 3]

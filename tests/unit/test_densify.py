@@ -184,6 +184,34 @@ def test_reset_lowers_opacities_and_forgets_their_moments(table):
     assert not rows.optimizer.state[rows.model.gaussians["opacity_logits"]]["exp_avg"].any()
 
 
+@pytest.mark.parametrize("least", [None, 0.01])
+def test_everything_happens_on_the_models_device(table, least):
+    """With another default device, whatever is made without asking where the model is cannot meet it."""
+    rows, _ = table
+    n = len(rows.model)
+    evidence, generator = Evidence(n), torch.Generator().manual_seed(0)
+    evidence.seen += 1
+    evidence.gradient[:9] = 2.0
+    world = rows.model.gaussians["log_scales"].detach().exp().amax(1) * 0.01
+    settings = replace(SETTINGS, split_scale=float(world[:9].median()), prune_least=least or 0.0)
+    worth = None if least is None else torch.arange(n, dtype=torch.float32)
+    sizes = torch.full((len(rows.model.faces),), 0.01)
+    with torch.device("meta"):
+        densify(
+            rows,
+            evidence,
+            settings,
+            face_sizes=sizes,
+            step=50,
+            room=20,
+            per_face=1,
+            generator=generator,
+            worth=worth,
+        )
+        reset_opacity(rows)
+    assert {p.device.type for p in rows.model.parameters()} == {"cpu"}
+
+
 def test_evidence_counts_only_where_visible():
     evidence = Evidence(3)
     evidence.add(torch.tensor([[3.0, 4.0], [1.0, 0.0], [9.0, 9.0]]), torch.tensor([2, 5, 0]))

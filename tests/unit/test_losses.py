@@ -67,7 +67,8 @@ def test_photometric_gradient():
 def test_position_and_scale_count_only_what_is_visible():
     means = torch.tensor([[0.0, 2.5, -3.0], [9.0, 9.0, 9.0], [0.1, 0.2, 0.3]])
     visible = torch.tensor([True, False, True])
-    assert abs(float(losses.position_loss(means, visible, 2.0)) - (0.5 + 1.0) / 3 / 2) < 1e-7
+    assert abs(float(losses.axis_position_loss(means, visible, 2.0)) - (0.5 + 1.0) / 3 / 2) < 1e-7
+    assert abs(float(losses.position_loss(means, visible, 2.0)) - (15.25**0.5 - 2) / 2) < 1e-6
     scales = torch.tensor([[4.0, 5.0, 0.5], [9.0, 9.0, 9.0], [0.5, 0.5, 0.5]])
     assert abs(float(losses.scale_loss(scales.log(), visible, 1.0)) - 5.0 / 2) < 1e-5
     assert float(losses.position_loss(means, torch.zeros(3, dtype=torch.bool), 2.0)) == 0

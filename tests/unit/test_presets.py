@@ -55,7 +55,7 @@ def test_densification(released):
     d = released.densify
     assert (d.gradient, d.most) == (1e-6, None)
     assert (d.split_scale, d.prune_opacity) == (0.01, 0.005)  # percent_dense 0.01 of an extent of 1
-    assert (d.prune_big_after, d.prune_radius, d.prune_scale) == (d.reset_every, 20.0, 0.1)
+    assert (d.prune_big_after, d.prune_radius, d.prune_scale) == (d.reset_every, math.inf, 0.1)
     assert (d.split_offset, d.prune_least) == ("world", 0.0)  # fact 30
 
 
@@ -65,6 +65,7 @@ def test_losses(released):
     assert (p.kind, p.weight, p.most, p.image_range) == ("lpips", 0.1, 0.9, "fixed")
     assert (w.position, w.position_limit, w.scale, w.scale_limit) == (1e-3, 2.0, 1.0, 1.0)  # fact 34
     assert (w.laplacian, w.deformation, w.rotation, w.pose) == (1.0, 0.4, 0.005, 1.0)  # fact 35
+    assert w.measures == "released"
     assert released.corrections == "neck"  # fact 32
 
 
@@ -98,6 +99,10 @@ def test_the_paper_differs_where_it_says_so_and_nowhere_else(name):
 def test_opacities_are_reset_at_the_first_growth_and_every_20k():
     d = preset_named("default", "released").densify
     assert [s for s in range(1, 100_001) if d.resets_at(s)] == [8_000, 20_000, 40_000, 60_000]
+    assert [s for s in range(1, 100_001) if d.grows_at(s)] == list(range(10_000, 69_000, 2_000))
+    medium = preset_named("medium", "released").densify
+    assert [s for s in range(1, 50_001) if medium.resets_at(s)] == [4_000, 10_000, 20_000, 30_000]
+    assert [s for s in range(200) if Densify(start=10, stop=30, every=10).grows_at(s)] == [10, 20, 30]
     assert not any(Densify(start=10, stop=100, every=10).resets_at(s) for s in range(200))
 
 

@@ -146,3 +146,29 @@ def test_missing_and_truncated(tmp_path):
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(DataError, match="whole and plain pickle"):
         read_pickle(path)
+
+
+def test_what_would_eat_time_memory_or_the_reader(tmp_path):
+    doubled = b"(" + b")q\0" + b"".join(b"h%ch%c\x86q%c" % (i, i, i + 1) for i in range(200)) + b"t"
+    dtype = b"cnumpy\ndtype\n(%stR(I3\nV<\ntb"
+    array = b"cnumpy\nndarray\n)R(I1\n%s%sI00\nX\0\0\0\0tb"
+    programs = {
+        "a number for the memo": (b"}r\0\0\0\x7f.", None),
+        "a key of tuples of tuples": (b"}" + doubled + b"Ns.", "unhashable type: 'tuple'"),
+        "a state for a function": (b"c_codecs\nencode\n}X\1\0\0\0aNsb.", "a state for what has none"),
+        "a type of tuples of tuples": (
+            b"}X\1\0\0\0v" + array % (b")", dtype % doubled) + b"s.",
+            "v: expected an array, found .*without a name",
+        ),
+        "a shape of lists": (
+            b"}X\1\0\0\0v" + array % (b"(]J\xff\xff\xff\x7ft", dtype % b"Vi1\n") + b"s.",
+            "v: expected an array, found .*other than some whole numbers",
+        ),
+    }
+    for name, (program, message) in programs.items():
+        (tmp_path / "bad.pkl").write_bytes(b"\x80\x02" + program)
+        if message is None:
+            assert read_pickle(tmp_path / "bad.pkl") == {}, name
+            continue
+        with pytest.raises(DataError, match=message):
+            pytest.fail(f"{name}: {read_pickle(tmp_path / 'bad.pkl')}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import struct
+import tracemalloc
 import zipfile
 from collections import OrderedDict
 from pathlib import Path
@@ -117,11 +118,11 @@ FIELDS = {
     "nan": (XYZ, with_nan, r"_xyz: expected finite values, found 1 that are not"),
     "nan scale": (SCALING, with_nan, r"_scaling: expected finite values"),
     "infinite scale": (SCALING, lambda t: t + 1e3, r"_scaling: expected numbers in \[-60, 20\]"),
-    "no rotation": (ROTATION, lambda t: t * 0, r"_rotation: expected norms of at least 1e-06, found 0"),
+    "no rotation": (ROTATION, lambda t: t * 0, r"_rotation: expected quaternions with norms of at least 1e-06, found 0"),
     "flat opacity": (OPACITY, lambda t: t[:, 0], r"_opacity: expected \[100, 1\], found \[100\]"),
     "channels first": (DC, lambda t: t.transpose(1, 2), r"_features_dc: expected \[100, 1, 3\]"),
     "degree": (DEGREE, lambda d: 4, r"active_sh_degree: expected 0 to 3, found 4"),
-    "degree as text": (DEGREE, lambda d: "3", r"active_sh_degree: expected 0 to 3, found 3"),
+    "degree as text": (DEGREE, lambda d: "3", r"active_sh_degree: expected 0 to 3, found str"),
     "harmonics": (REST, lambda t: t[:, :7], r"_features_rest: expected harmonics of a degree up to 3"),
     "binding too large": (BINDING, lambda t: t + 1, r"binding: expected indices 0 to 39, found 40"),
     "binding negative": (BINDING, lambda t: t - 1, r"binding: expected indices 0 to 39, found -1"),
@@ -229,16 +230,25 @@ def tensor_pickle(shape: bytes, stride: bytes, *, offset: bytes = b"K\0", count:
     return b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + storage + offset + shape + stride + tail
 
 
+IMPOSSIBLE = "impossible sizes, strides or offset"
 VIEWS = {
     "beyond": (tensor_pickle(b"K\x05\x85", b"K\x01\x85"), "beyond 4 numbers|of 4 numbers"),
     "offset": (tensor_pickle(b"K\x02\x85", b"K\x01\x85", offset=b"K\x03"), "beyond 4 numbers"),
     "stride": (tensor_pickle(b"K\x02\x85", b"K\x04\x85"), "beyond 4 numbers"),
-    "negative stride": (tensor_pickle(b"K\x02\x85", b"J\xff\xff\xff\xff\x85"), r"strides \(-1,\)"),
-    "negative offset": (tensor_pickle(b"K\x02\x85", b"K\x01\x85", offset=b"J\xff\xff\xff\xff"), "offset -1"),
+    "negative stride": (tensor_pickle(b"K\x02\x85", b"J\xff\xff\xff\xff\x85"), IMPOSSIBLE),
+    "negative offset": (tensor_pickle(b"K\x02\x85", b"K\x01\x85", offset=b"J\xff\xff\xff\xff"), IMPOSSIBLE),
     "one number a billion times": (tensor_pickle(b"J\0\0\0\x0f\x85", b"K\0\x85"), "of 4 numbers"),
-    "text for a size": (tensor_pickle(b"X\x01\0\0\0" + b"a\x85", b"K\x01\x85"), "sizes"),
-    "other lengths": (tensor_pickle(b"K\x02\x85", b")"), "sizes"),
+    "text for a size": (tensor_pickle(b"X\x01\0\0\0" + b"a\x85", b"K\x01\x85"), IMPOSSIBLE),
+    "a size of 2000 bits": (
+        tensor_pickle(b"\x8a\xfa" + 249 * b"\xff" + b"\x01\x85", b"K\x01\x85"),
+        IMPOSSIBLE,
+    ),
+    "other lengths": (tensor_pickle(b"K\x02\x85", b")"), IMPOSSIBLE),
     "another size of storage": (tensor_pickle(b"K\x02\x85", b"K\x01\x85", count=b"K\x05"), "found 16 bytes"),
+    "a storage without end": (
+        tensor_pickle(b"K\x02\x85", b"K\x01\x85", count=b"J\0\0\0\x7f"),
+        "of another kind",
+    ),
 }
 
 
@@ -246,7 +256,7 @@ VIEWS = {
 def test_a_tensor_that_reaches_beyond_its_storage_is_refused(tmp_path, case):
     data, message = VIEWS[case]
     path = zipped(tmp_path / "x.pth", {"data.pkl": data, "data/0": struct.pack("<4f", 1, 2, 3, 4)})
-    with TorchFile(path) as file, pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=message), TorchFile(path) as file:
         file.array("tensor", file.content)
 
 
@@ -291,6 +301,64 @@ ARCHIVES = {
         "data.pkl: expected tensors and plain containers",
     ),
 }
+
+
+def doubled(levels: int) -> bytes:
+    """Operations for a tuple of the last tuple twice, and so on: 2^levels ends in a few bytes."""
+    return b")q\0" + b"".join(b"h%ch%c\x86q%c" % (i, i, i + 1) for i in range(levels))
+
+
+BOMBS = {
+    "a number for the memo": (b"}r\0\0\0\x7f.", "expected \\(dict, iteration\\), found dict of 0"),
+    "a key of tuples of tuples": (b"}(" + doubled(200) + b"tNs.", "unhashable type: 'tuple'"),
+    "one made by torch.Size": (
+        b"}ctorch\nSize\n((" + doubled(200) + b"ttRNs.",
+        "unhashable type: 'tuple'",
+    ),
+    "a set of them": (b"\x8f(" + doubled(200) + b"\x90.", "data.pkl: expected tensors and plain"),
+    "a state for a kind of storage": (
+        b"ctorch\nFloatStorage\n}X\x04\0\0\0nameX\x0b\0\0\0LongStoragesb.",
+        "a state for what has none",
+    ),
+    "a state for a function": (b"c_codecs\nencode\n}X\x01\0\0\0aNsb.", "a state for what has none"),
+    "a state for a tensor": (
+        tensor_pickle(b"K\x01\x85", b"K\x01\x85")[2:-1] + b"}X\x05\0\0\0shapeNsb.",
+        "a state for what has none",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BOMBS)
+def test_a_pickle_that_would_eat_time_memory_or_the_reader_is_refused_at_once(tmp_path, case):
+    operations, message = BOMBS[case]
+    path = zipped(tmp_path / "x.pth", {"data.pkl": b"\x80\x02" + operations})
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=message):
+            read_official(path, faces=FACES)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    whole = zipped(
+        tmp_path / "y.pth", {"data.pkl": tensor_pickle(b"K\x04\x85", b"K\x01\x85"), "data/0": bytes(16)}
+    )
+    with TorchFile(whole) as file:  # and nothing stays behind for the next file
+        assert file.array("tensor", file.content).dtype == np.float32
+
+
+def test_what_is_shown_of_a_wrong_number_is_short(tmp_path, state):
+    for degree, found in ((4, "4"), ([[0] * 9], "list of 1"), (1 << 99, "int"), ("3", "str")):
+        path = saved(tmp_path / "x.pth", with_field(state, DEGREE, degree))
+        with pytest.raises(DataError, match=rf"active_sh_degree: expected 0 to 3, found {found}$"):
+            read_official(path, faces=FACES)
+
+
+def test_a_network_of_one_storage_over_and_over_is_not_read(tmp_path, state):
+    large = torch.zeros(1 << 22)
+    net = {**state[0]["deform_net"], **{f"more.{i}": large for i in range(130)}}
+    path = saved(tmp_path / "x.pth", ({**state[0], "deform_net": net}, 1))
+    with pytest.raises(DataError, match="deform_net: expected at most 536870912 numbers"):
+        read_official(path, faces=FACES)
 
 
 @pytest.mark.parametrize("case", ARCHIVES)

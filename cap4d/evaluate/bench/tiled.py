@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cap4d.camera import NEAR, Camera
-from cap4d.gaussians import Gaussians
+from cap4d.gaussians import SH_COUNTS, Gaussians
+from cap4d.harmonics import sh_basis
 from cap4d.rotation import quat_to_rotmat
 
 EPS2D = 0.3  # px^2; these constants are those of src/cpp/constants.h, where each has its provenance
@@ -146,25 +147,8 @@ def footprints(
 
 def eval_sh(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Colours [V, 3] = 0.5 + SH `sh` [V, S, 3] along `directions` [V, 3], before the clamp at 0."""
-    basis = sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True), sh.shape[1])
+    basis = sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True), SH_COUNTS[sh.shape[1]])
     return np.einsum("vs,vsc->vc", basis, sh) + sh.dtype.type(0.5)
-
-
-def sh_basis(directions: np.ndarray, count: int) -> np.ndarray:
-    """[V, count] real spherical harmonics of unit directions [V, 3], order and signs of 3DGS."""
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    basis = (
-        0.28209479177387814 * np.ones_like(x),
-        *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
-        *(1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy)),
-        *(-1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy)),
-        *(-0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z),
-        *(-0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy)),
-        *(-0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy)),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    )
-    return np.stack(basis[:count], 1)
 
 
 def tiles(splats: Splats, camera: Camera) -> Iterator[Tile]:
