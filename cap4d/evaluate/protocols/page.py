@@ -43,11 +43,11 @@ def draw_page(output: Path, titles: Sequence[str], strips: Sequence[Strip]) -> N
     Args:
         titles: Of the pictures' columns, in order; a strip need not have all.
     """
-    draw_sheet(output / "page.png", titles, [(s.title, s.pictures) for s in strips])
     lines = (output / "table.md").read_text(encoding="utf-8").splitlines()
     body = as_html(lines) + _pictures(output, titles, strips)
     with replacing(output / "page.html") as temporary:
         temporary.write_text(body, encoding="utf-8")
+    draw_sheet(output / "page.png", titles, [(s.title, s.pictures) for s in strips])
 
 
 def strips_of(output: Path, results: Sequence[Result], identity: str) -> list[Strip]:
