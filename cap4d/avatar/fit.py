@@ -70,6 +70,7 @@ def fit(
     references: Sequence[tuple[str, int]] | None = None,
     hold_out: Sequence[str] = (),
     device: str = "auto",
+    tiers: bool = True,
 ) -> FitReport:
     """Fits an avatar and writes it, its report and its picture.
 
@@ -89,6 +90,7 @@ def fit(
             held out.
         hold_out: Cameras of the first capture that are never trained on.
         device: `auto`, `cpu` or `cuda` (see `device_named`).
+        tiers: Also make the cheaper deformers for small machines (see `export_bundle`).
     Raises:
         ArgumentError: An unknown preset or ablation, or no frame to train on.
         DataError: A capture is malformed or of another rig, or the checkpoint of another fit.
@@ -112,8 +114,8 @@ def fit(
     log.info("%s", outlook(trainer, split, place))
     pace = run(trainer, lambda: journal.save(trainer))
     trainer.move(torch.device("cpu"))
-    times = {"seconds": journal.seconds, "pace": pace}
-    report = finish(trainer, loaded[0], split, rig, output, ablate=ablate, device=place, **times)
+    rest = {"device": place, "seconds": journal.seconds, "pace": pace, "tiers": tiers}
+    report = finish(trainer, loaded[0], split, rig, output, ablate=ablate, **rest)
     journal.close()
     return report
 
@@ -290,6 +292,7 @@ def finish(
     device: torch.device,
     seconds: Callable[[], float],
     pace: float,
+    tiers: bool = True,
 ) -> FitReport:
     """Compares with the held-out frames and writes avatar, numbers and picture.
 
@@ -298,12 +301,13 @@ def finish(
         device: Where it was fitted; the trainer is back on the CPU.
         seconds: How long it has taken.
         pace: Mean time of a step, s.
+        tiers: See `fit`.
     """
     from cap4d.export.bundle import export_bundle
 
     comparison = compare(trainer, split) if split.held_out else None
     clip = trainer.corrections[0].corrected(capture.clip())
-    export_bundle(trainer.model, output, rig=rig, capture=capture, clip=clip)
+    export_bundle(trainer.model, output, rig=rig, capture=capture, clip=clip, tiers=tiers)
     if comparison is not None:
         write_sheet(comparison, output.with_suffix(".fit.png"))
     times = {"seconds": seconds(), "step_ms": 1e3 * pace}

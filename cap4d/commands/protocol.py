@@ -16,7 +16,7 @@ paper's own counts are 9 identities, 4 held-out cameras x 100 frames at 512 px."
 CROSS = """There is no ground truth: nobody knows how the avatar's person would look. Measured are identity
 (CSIM, against the avatar's own face at rest) and whether expression, gaze, lids and head do what the
 driver's do, as the same estimator sees both pictures. Numbers that compare pixels with the driver's would
-reward looking like the driver, and are left out. Written: report.json, table.md, page.png."""
+reward looking like the driver, and are left out. Written: report.json, table.md, page.html and page.png."""
 
 
 def add(commands) -> None:

@@ -32,6 +32,7 @@ from cap4d.rig.flame import RELEASED_RIG
 from cap4d.track.progress import progress
 
 WHITE = (1.0, 1.0, 1.0)
+SIZES = 16, 16384  # px of the larger side
 NEED_FACES = ("CSIM", "AED", "APD", "AKD", "gaze", "blink", "AKD-fan", "AED-mp", "APD-mp")
 PACKAGES = ("cap4d", "numpy", "onnxruntime", "torch", "mediapipe", "pyfvvdp")
 
@@ -70,8 +71,8 @@ def evaluate(
         DataError: A file is not sound, or the capture is of another rig.
     """
     started = time.monotonic()
-    if size is not None and not 16 <= size <= 16384:
-        raise ArgumentError(f"size: expected 16 to 16384 px, got {size}")
+    if size is not None and not SIZES[0] <= size <= SIZES[1]:
+        raise ArgumentError(f"size: expected {SIZES[0]} to {SIZES[1]} px, got {size}")
     player = Avatar.load(avatar, deformer=deformer, deformer_budget_ms=math.inf)
     person = Capture.load(capture)
     check_rig(person, player)

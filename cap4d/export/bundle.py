@@ -40,6 +40,7 @@ def export_bundle(
     rig: HeadRig,
     capture: Capture,
     clip: Clip | None = None,
+    tiers: bool = True,
 ) -> None:
     """Writes `path`, a `.cap4d` file.
 
@@ -49,21 +50,32 @@ def export_bundle(
         capture: Its identity is the avatar's, its most frontal camera the default one.
         clip: The capture's parameters as the fit corrected them, for the idle clip; None: as they were
             tracked.
+        tiers: Add the deformer's cheaper forms, too, which take most of the time; whoever plays the exact one
+            does without.
     Raises:
         Cap4dError: The exported network does not answer as the fitted one does.
     """
     clip = capture.clip() if clip is None else clip
-    write_bundle(make_bundle(model, rig=rig, capture=capture, clip=clip), path)
+    write_bundle(make_bundle(model, rig=rig, capture=capture, clip=clip, tiers=tiers), path)
 
 
-def make_bundle(model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Clip) -> Bundle:
+def make_bundle(
+    model: AvatarModel, *, rig: HeadRig, capture: Capture, clip: Clip, tiers: bool = True
+) -> Bundle:
     """The avatar as a player needs it. `clip` is the capture's, corrected or not."""
-    camera = default_camera(capture, clip)
-    return bundle_of(model, rig=rig, shape=capture.shape, clip=clip, idle=idle_clip(clip, rig), camera=camera)
+    camera, idle = default_camera(capture, clip), idle_clip(clip, rig)
+    return bundle_of(model, rig=rig, shape=capture.shape, clip=clip, idle=idle, camera=camera, tiers=tiers)
 
 
 def bundle_of(
-    model: AvatarModel, *, rig: HeadRig, shape: np.ndarray, clip: Clip, idle: Clip, camera: Camera
+    model: AvatarModel,
+    *,
+    rig: HeadRig,
+    shape: np.ndarray,
+    clip: Clip,
+    idle: Clip,
+    camera: Camera,
+    tiers: bool = True,
 ) -> Bundle:
     """The same without a capture.
 
@@ -72,6 +84,7 @@ def bundle_of(
         clip: What its network is compared and made cheaper on, besides `idle`.
         idle: What plays when nothing drives the avatar.
         camera: The default view, in the head-fixed world.
+        tiers: See `export_bundle`.
     """
     mesh_subject = rig.subject(shape)
     local = {name: value.detach().numpy() for name, value in model.gaussians.items()}
@@ -93,7 +106,7 @@ def bundle_of(
         preview=preview(model, clip, camera),
         mesh_subject=mesh_subject,
     )
-    if model.deformer is None:
+    if model.deformer is None or not tiers:
         return bundle
     bundle = with_tiers(bundle, [] if clip is idle else [clip])
     return replace(bundle, tier_errors={"full": float32_error(bundle, model, clip), **bundle.tier_errors})

@@ -19,6 +19,11 @@ from cap4d.synth.complexion import Complexion
 MM = 1e-3
 LIP, LIP_INSIDE, NOSE_TIP, NOSE_BASE, CHIN = slice(48, 60), slice(60, 68), 30, 33, 8
 BROWS, EYES = (slice(17, 22), slice(22, 27)), (slice(36, 42), slice(42, 48))
+CAVITY = np.array([0.16, 0.045, 0.04])  # linear RGB of the inside of a mouth
+MOLARS = (
+    0.010,
+    0.026,
+)  # m behind the incisors: over this way teeth fade into the mouth's dark, as cheeks hide them
 PUPIL_DEG, IRIS_DEG = 8.5, 25.0  # from the gaze's direction, seen from the ball's centre
 
 
@@ -73,44 +78,77 @@ def near(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _skin(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Paint:
-    p, marks, seed = atlas.points[texels], _landmarks(rig), look.seed
+    p, marks = atlas.points[texels], _landmarks(rig)
+    melanin, blood = _pigments(rig, p, marks, look)
+    lips = _lips(rig, p, atlas.old[texels], marks)
+    scalp = np.clip(atlas.of_vertices(look.scalp, texels), 0, 1)
+    bare = _bare_skin(p, marks, look, look.skin(melanin, blood))
+    tint = look.skin(melanin * 0.6, blood + 0.75 + 1.2 * look.lip) * look.lip_tint
+    return _with_hair(_with_lips(bare, p, look, lips, tint), rig, p, marks, look, lips, scalp)
+
+
+def _pigments(
+    rig: HeadRig, p: np.ndarray, marks: np.ndarray | None, look: Complexion
+) -> tuple[np.ndarray, np.ndarray]:
+    """[N] and [N] amounts of melanin and haemoglobin."""
+    seed = look.seed
     melanin = look.melanin * (1 + 0.10 * noise(p, 0.035, seed + 1, 3) + 0.06 * noise(p, 0.004, seed + 2, 2))
     blood = look.haemoglobin * (1 + 0.22 * noise(p, 0.018, seed + 3, 3) + 0.12 * noise(p, 0.003, seed + 4, 2))
     blood = blood + look.blush * 0.45 * _flush(p, marks)
     melanin = melanin + look.freckles * _freckles(p, marks, seed) + look.moles * _moles(p, seed)
     socket = _around_eyes(p, rig)
-    blood += 0.22 * socket
-    melanin += 0.12 * socket * (0.5 + look.melanin)
-    albedo = look.skin(melanin, blood)
-    shine = 0.40 + 0.22 * _oily(p, marks) + 0.10 * noise(p, 0.006, seed + 5, 2)
-    rough = 0.52 - 0.07 * _oily(p, marks)
-    pores, _ = spots(p, 1.1 * MM, seed + 6)
-    height = 0.06 * MM * np.minimum(pores / MM, 0.6) + 0.05 * MM * noise(p, 1.8 * MM, seed + 7, 2)
-    scatter = np.ones(len(p), np.float32)
+    return melanin + 0.12 * socket * (0.5 + look.melanin), blood + 0.22 * socket
 
-    lips = _lips(rig, p, atlas.old[texels], marks)
-    tint = look.skin(melanin * 0.6, blood + 0.75 + 1.2 * look.lip) * look.lip_tint
-    lip_mix = lips * (0.55 + 0.35 * look.lip)
-    albedo = albedo + lip_mix[:, None] * (tint - albedo)
-    folds = noise(p * [1.0, 0.22, 0.22], 1.5 * MM, seed + 8, 2)
-    height = height * (1 - lips) + lips * 0.16 * MM * folds
-    albedo *= (1 - 0.10 * lips * np.maximum(folds, 0))[:, None]
-    shine, rough = shine + 0.15 * lips, rough - 0.12 * lips
 
+def _bare_skin(p: np.ndarray, marks: np.ndarray | None, look: Complexion, albedo: np.ndarray) -> Paint:
+    shine = 0.40 + 0.22 * _oily(p, marks) + 0.10 * noise(p, 0.006, look.seed + 5, 2)
+    pores, _ = spots(p, 1.1 * MM, look.seed + 6)
+    height = 0.06 * MM * np.minimum(pores / MM, 0.6) + 0.05 * MM * noise(p, 1.8 * MM, look.seed + 7, 2)
+    return Paint(albedo, shine, 0.52 - 0.07 * _oily(p, marks), np.ones(len(p), np.float32), height)
+
+
+def _with_lips(skin: Paint, p: np.ndarray, look: Complexion, lips: np.ndarray, tint: np.ndarray) -> Paint:
+    """Skin that is as much vermilion as `lips` [N] say, of colour `tint` [N, 3]."""
+    mix = lips * (0.55 + 0.35 * look.lip)
+    folds = noise(p * [1.0, 0.22, 0.22], 1.5 * MM, look.seed + 8, 2)
+    creased = (1 - 0.10 * lips * np.maximum(folds, 0))[:, None]
+    return replace(
+        skin,
+        albedo=(skin.albedo + mix[:, None] * (tint - skin.albedo)) * creased,
+        specular=skin.specular + 0.15 * lips,
+        roughness=skin.roughness - 0.12 * lips,
+        height=skin.height * (1 - lips) + lips * 0.16 * MM * folds,
+    )
+
+
+def _with_hair(
+    skin: Paint,
+    rig: HeadRig,
+    p: np.ndarray,
+    marks: np.ndarray | None,
+    look: Complexion,
+    lips: np.ndarray,
+    scalp: np.ndarray,
+) -> Paint:
+    """Skin with what strands do not draw: stubble, the ground of brows, lashes and hair (`scalp` [N])."""
+    seed, albedo = look.seed, skin.albedo.copy()
     beard = _stubble(p, marks, seed) * look.stubble * (1 - lips)
     albedo += beard[:, None] * (look.hair * 0.8 + 0.15 * albedo - albedo)
     brows = 0.5 * _brows(rig, p, marks, seed) * look.brow
     albedo += brows[:, None] * (look.hair * 0.75 + 0.02 - albedo)
     lash = _lash_line(rig, p, marks)
     albedo += (0.75 * lash)[:, None] * (look.hair * 0.5 + 0.01 - albedo)
-    hair = np.clip(atlas.of_vertices(look.scalp, texels), 0, 1)
-    hair = paint.soft_step(hair + 0.35 * noise(p, 2.5 * MM, seed + 18, 2), 0.25, 0.85)
+    hair = paint.soft_step(scalp + 0.15 * noise(p, 2.5 * MM, seed + 18, 2), 0.25, 0.85)
     strands = 1 + 0.5 * noise(p * [1, 0.35, 0.35], 1.2 * MM, seed + 9, 2)
     albedo += (0.92 * hair)[:, None] * (look.hair * strands[:, None] + 0.03 * albedo - albedo)
-    height += hair * 0.25 * MM * noise(p, 1.5 * MM, seed + 10, 2)
     covered = np.clip(hair + brows + beard, 0, 1)
-    shine, scatter = shine * (1 - 0.6 * covered), scatter * (1 - 0.9 * covered)
-    return Paint(np.clip(albedo, 0.002, 0.95), shine, rough + 0.08 * covered, scatter, height)
+    return Paint(
+        np.clip(albedo, 0.002, 0.95),
+        skin.specular * (1 - 0.6 * covered),
+        skin.roughness + 0.08 * covered,
+        skin.scattering * (1 - 0.9 * covered),
+        skin.height + hair * 0.25 * MM * noise(p, 1.5 * MM, seed + 10, 2),
+    )
 
 
 def _landmarks(rig: HeadRig) -> np.ndarray | None:
@@ -314,8 +352,10 @@ def _eyeball(arm: np.ndarray, angle: np.ndarray, look: Complexion, seed: int) ->
 def _teeth(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Paint:
     p, one = atlas.points[texels], np.ones(len(texels))
     shade = 1 + 0.06 * noise(p, 0.006, look.seed + 30, 2)
-    albedo = np.array([0.72, 0.66, 0.54]) * shade[:, None]
-    return Paint(albedo, 0.9 * one, 0.25 * one, 0.3 * one, 0 * one)
+    front = p[:, 2].max()
+    lit = paint.soft_step(p[:, 2], front - MOLARS[1], front - MOLARS[0])
+    albedo = CAVITY + lit[:, None] * (np.array([0.72, 0.66, 0.54]) * shade[:, None] - CAVITY)
+    return Paint(albedo, 0.9 * lit, 0.25 * one, 0.3 * one, 0 * one)
 
 
 def _gums(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Paint:
@@ -327,7 +367,7 @@ def _gums(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> P
 
 def _cavity(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Paint:
     one = np.ones(len(texels))
-    return Paint(np.tile([0.16, 0.045, 0.04], (len(texels), 1)), 0.5 * one, 0.4 * one, one, 0 * one)
+    return Paint(np.tile(CAVITY, (len(texels), 1)), 0.5 * one, 0.4 * one, one, 0 * one)
 
 
 def _cloth(rig: HeadRig, atlas: Atlas, texels: np.ndarray, look: Complexion) -> Paint:

@@ -15,7 +15,7 @@ from cap4d.rig.head import HeadRig, Subject
 from cap4d.synth.atlas import KINDS, build_atlas, kinds_of_vertices
 from cap4d.synth.complexion import Complexion, draw_complexion
 from cap4d.synth.face_paint import paint_texture
-from cap4d.synth.hair import Hair, HairLights, composite_hair, draw_hair, grow_hair
+from cap4d.synth.hair import Hair, HairLights, LitHair, composite_hair, draw_hair, grow_hair, light_hair
 from cap4d.synth.idle import expression_vector, speaks_arkit
 from cap4d.synth.light import Lights, Occlusion, cast_shadows, draw_lights
 
@@ -63,13 +63,13 @@ class Samples:
 @dataclass(frozen=True, eq=False)
 class Pose:
     """The person in one frame, head-fixed, OpenCV axes: vertices, their normals and smoothed normals [V, 3],
-    and the points of the hair.
+    and the hair in its light.
     """
 
     vertices: np.ndarray
     normals: np.ndarray
     soft: np.ndarray
-    hair: np.ndarray
+    hair: LitHair
 
 
 def draw_person(rig: HeadRig, identity: int, *, texels: int = 1024) -> Person:
@@ -99,7 +99,8 @@ def pose_person(person: Person, vertices: np.ndarray) -> Pose:
     """What all pictures of one frame share. `vertices` [V, 3] head-fixed, OpenCV axes."""
     faces = person.rig.faces
     normals = vertex_normals(vertices, faces)
-    return Pose(vertices, normals, _smoothed(normals, person.neighbours), person.hair.pose(vertices))
+    hair = light_hair(person.hair, person.hair.pose(vertices), _hair_lights(person.lights))
+    return Pose(vertices, normals, _smoothed(normals, person.neighbours), hair)
 
 
 def draw_samples(person: Person, pose: Pose, camera: Camera) -> Samples:
@@ -136,7 +137,7 @@ def picture(person: Person, pose: Pose, camera: Camera) -> tuple[np.ndarray, np.
     large = camera.resized(camera.width * SUPERSAMPLE, camera.height * SUPERSAMPLE)
     samples = draw_samples(person, pose, large)
     rgb, matte = develop(samples, SUPERSAMPLE)
-    layer = draw_hair(person.hair, pose.hair, camera, _hair_lights(person.lights), samples.depth)
+    layer = draw_hair(pose.hair, camera, samples.depth)
     return composite_hair(rgb, matte, layer)
 
 

@@ -31,6 +31,7 @@ constexpr float kBleed[3] = {0.45f, 0.12f, 0.0f};        // how much a shadow's 
 constexpr float kF0 = 0.028f;                            // reflectance of skin and of tears, face on
 constexpr float kBroadLobe = 0.7f;                       // of the highlight; the rest is narrower by:
 constexpr float kNarrow = 0.6f;
+constexpr float kBehind = 0.3f;  // share of the sky that the inside of a mouth or a neck sees of what its outside would
 
 Channels sample(const Texture& texture, float u, float v) {
   const float x = std::clamp(u - 0.5f, 0.0f, texture.size - 1.001f), y = std::clamp(v - 0.5f, 0.0f, texture.size - 1.001f);
@@ -48,9 +49,9 @@ Channels sample(const Texture& texture, float u, float v) {
 }
 
 // Gradients of the two texture coordinates on a triangle, in space: what turns the height's slopes into a surface gradient
-// (Mikkelsen 2010).
+// (Mikkelsen 2010). `outwards` is the triangle's normal, not of unit length.
 struct Frame {
-  Vec u, v;
+  Vec u, v, outwards;
 };
 
 Frame texture_frame(const LitSurface& s, std::size_t f) {
@@ -60,9 +61,9 @@ Frame texture_frame(const LitSurface& s, std::size_t f) {
   const float* t2 = &s.uvs[2 * s.uv_faces[3 * f + 2]];
   const Vec n = cross(e1, e2);
   const float area = dot(n, n);
-  if (area < 1e-24f) return {{0, 0, 0}, {0, 0, 0}};
+  if (area < 1e-24f) return {{0, 0, 0}, {0, 0, 0}, n};
   const Vec g1 = cross(e2, n) * (1 / area), g2 = cross(n, e1) * (1 / area);  // gradients of the barycentrics of e1, e2
-  return {g1 * (t1[0] - t0[0]) + g2 * (t2[0] - t0[0]), g1 * (t1[1] - t0[1]) + g2 * (t2[1] - t0[1])};
+  return {g1 * (t1[0] - t0[0]) + g2 * (t2[0] - t0[0]), g1 * (t1[1] - t0[1]) + g2 * (t2[1] - t0[1]), n};
 }
 
 float fresnel(float cosine) {
@@ -85,9 +86,15 @@ float bounced(float open, float albedo) {
 struct Point {
   Vec position, normal, soft, view;
   float open;
-  const float* visible;
   Channels material;
 };
+
+// A surface seen from behind: its normals point away, and what they see of the lights is the other side's.
+void turn_over(Point& p, Vec& smooth, std::vector<float>& visible) {
+  smooth = smooth * -1, p.soft = p.soft * -1;
+  p.open *= kBehind;
+  std::fill(visible.begin(), visible.end(), 0.0f);
+}
 
 void add_light(const Point& p, Vec l, const float* color, float visible, float* out) {
   const float scatter = p.material[5];
@@ -152,8 +159,9 @@ void light_surface(const LitSurface& s, const Texture& texture, const Lighting& 
     }
     p.material = sample(texture, u, v);
     p.view = unit(vec(lighting.eye) - p.position);
-    const Vec smooth = unit(p.normal);
+    Vec smooth = unit(p.normal);
     p.soft = unit(p.soft);
+    if (dot(frame.outwards, p.view) < 0) turn_over(p, smooth, visible);
     Vec slope = frame.u * p.material[6] + frame.v * p.material[7];
     slope = slope - smooth * dot(slope, smooth);
     p.normal = unit(smooth - slope);

@@ -10,6 +10,7 @@ from tiny_avatar import GRID, tiny_rig
 from tiny_ring import write_tiny_ring
 
 from cap4d.avatar.presets import PRESETS, Densify
+from cap4d.bundle import read_bundle
 from cap4d.errors import ArgumentError, DataError
 from cap4d.evaluate.metrics.weights import Weights
 from cap4d.evaluate.protocols import cell as cell_module
@@ -60,6 +61,11 @@ def test_every_cell_is_there(made):
     ]  # fmt: skip
 
 
+def test_cells_are_spared_the_deformers_that_judge_nothing(made):
+    tiers = {read_bundle(r.folder / "avatar.cap4d").tiers for r in made[1]}
+    assert tiers == {("full", "off"), ("off",)}
+
+
 def test_held_out_cameras_are_judged_and_never_trained_on(made):
     for result in made[1]:
         held_out = set(result.cell.hold_out)
@@ -96,6 +102,7 @@ def test_the_tables_say_what_was_measured(made):
 def test_the_page_shows_files_that_are_there(made):
     output = made[0]
     text = (output / "page.html").read_text()
+    assert "<title>Self-reenactment</title>" in text
     sources = re.findall(r"src='([^']+)'", text)
     assert len(sources) == 2 * 2 * (1 + 4)  # people x views x columns
     assert all((output / source).is_file() for source in sources)
@@ -157,6 +164,9 @@ def test_a_cell_that_fails_does_not_lose_the_others(data, tmp_path, monkeypatch)
         ({"references": (0,)}, "references"),
         ({"references": (100,)}, "references: expected 1 to 12, got 100"),
         ({"hold_out": 9}, "hold_out_cameras"),
+        ({"size": 0}, "size: expected 16 to"),
+        ({"frames": 0}, "frames: expected at least 1"),
+        ({"reference_seed": -1}, "reference_seed: expected"),
         ({"hold_out": ("nobody",)}, "nobody"),
     ],
 )

@@ -1,6 +1,7 @@
 """Cross-reenactment: which frames, what is kept, what is said; the estimators themselves are tested apart."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -63,6 +64,10 @@ def test_every_avatar_is_driven_by_everybody(people, measured, tmp_path):
     report = json.loads((tmp_path / "cross" / "report.json").read_text())
     assert report["cells"][0]["values"]["gaze"] == [2.0, None]
     assert (tmp_path / "cross" / "page.png").stat().st_size > 1000
+    page = (tmp_path / "cross" / "page.html").read_text()
+    assert "<title>Cross-reenactment</title>" in page
+    sources = re.findall(r"src='([^']+)'", page)
+    assert len(sources) == 2 * 3 and all((tmp_path / "cross" / source).is_file() for source in sources)
 
 
 def test_what_is_finished_is_kept(people, measured, tmp_path):

@@ -21,6 +21,7 @@ from cap4d.evaluate.metrics.eyes import EYES, IRISES, aspect_ratios, iris_diamet
 from cap4d.evaluate.metrics.fan import FanDistance, peaks  # noqa: E402
 from cap4d.evaluate.metrics.flame import ExpressionDistance, FlameRegressor, PoseDistance  # noqa: E402
 from cap4d.evaluate.metrics.gaze import GazeError  # noqa: E402
+from cap4d.evaluate.metrics.jod import JustObjectionableDifference  # noqa: E402
 from cap4d.evaluate.metrics.keypoints import IBUG_68, KeypointDistance  # noqa: E402
 from cap4d.evaluate.metrics.psnr import PersonPsnr, Psnr  # noqa: E402
 from cap4d.evaluate.metrics.registry import METRIC_NAMES, metrics_available  # noqa: E402
@@ -33,6 +34,7 @@ from cap4d.evaluate.metrics.tracked import (  # noqa: E402
 from cap4d.evaluate.metrics.warp import cut, similarity  # noqa: E402
 from cap4d.evaluate.metrics.weights import Weights  # noqa: E402
 from cap4d.evaluate.pair import MIN_SIDE, Pair  # noqa: E402
+from cap4d.evaluate.protocols.gains import HIGHER  # noqa: E402
 
 FACE_METRICS = (KeypointDistance(), GazeError(), BlinkError())
 
@@ -497,11 +499,17 @@ def test_lpips_without_weights_says_what_it_needs(tmp_path, monkeypatch):
 # JOD
 
 
-def test_jod_falls_with_harm_and_a_video_is_taken_in_order():
-    for module in ("pyfvvdp", "ffmpeg", "past", "imageio", "torch"):
-        pytest.importorskip(module, reason="needs the extra [jod]")
-    from cap4d.evaluate.metrics.jod import JustObjectionableDifference
+@pytest.fixture
+def fvvdp():
+    for module in ("torch", "pyfvvdp", "ffmpeg", "past", "imageio"):
+        pytest.importorskip(
+            module,
+            reason="needs FovVideoVDP, for non-commercial use only and so never installed by itself: "
+            "pip install 'cap4d[jod]', then pip install --no-deps pyfvvdp",
+        )
 
+
+def test_jod_falls_with_harm_and_a_video_is_taken_in_order(fvvdp):
     metric, image = JustObjectionableDifference(), soft_noise(96)
     values = [metric.measure(Pair(blurred(image, sigma), image)) for sigma in (0, 1, 2)]
     assert values[0] == 10
@@ -517,11 +525,7 @@ def test_jod_falls_with_harm_and_a_video_is_taken_in_order():
     assert taken == [0, 1, 2, 3]
 
 
-def test_jod_is_what_fovvideovdp_says_of_whole_arrays():
-    for module in ("pyfvvdp", "ffmpeg", "past", "imageio", "torch"):
-        pytest.importorskip(module, reason="needs the extra [jod]")
-    from cap4d.evaluate.metrics.jod import JustObjectionableDifference
-
+def test_jod_is_what_fovvideovdp_says_of_whole_arrays(fvvdp):
     metric = JustObjectionableDifference()
     truth = np.stack([shifted(soft_noise(64), i) for i in range(4)])
     film = np.clip(truth + 0.05, 0, 1)
@@ -546,6 +550,14 @@ def test_every_metric_is_there_or_says_what_it_needs(tmp_path, monkeypatch):
         if metric.name not in absent:
             assert metric.better in ("higher", "lower")
             assert len(type(metric).__doc__) > 80  # its definition, which reports quote
+
+
+def test_tables_know_of_which_metrics_more_is_better():
+    kinds = [Psnr, PersonPsnr, Ssim, IdentitySimilarity, lpips.LpipsMetric, JustObjectionableDifference]
+    kinds += [FanDistance, ExpressionDistance, PoseDistance, TrackedExpressionDistance, TrackedPoseDistance]
+    kinds += [KeypointDistance, GazeError, BlinkError]
+    assert {kind.name for kind in kinds} == set(METRIC_NAMES)
+    assert {kind.name for kind in kinds if kind.better == "higher"} == HIGHER
 
 
 def test_metrics_are_chosen_by_name():

@@ -122,6 +122,14 @@ def test_the_player_poses_what_was_fitted(tmp_path):
     assert 0 < rms <= worst < 1e-4, "float32 against float64, mm"
 
 
+def test_the_cheaper_deformers_can_be_left_out(tmp_path):
+    model = tiny_avatar(tiny_rig())
+    trained_looking(model.deformer)
+    capture, _ = capture_and_clip(tmp_path)
+    export_bundle(model, tmp_path / "x.cap4d", rig=tiny_rig(), capture=capture, tiers=False)
+    assert read_bundle(tmp_path / "x.cap4d").tiers == ("full", "off")
+
+
 def test_an_export_that_differs_is_refused(tmp_path, monkeypatch):
     rig = tiny_rig()
     model = tiny_avatar(rig)

@@ -11,7 +11,7 @@ from cap4d.errors import ArgumentError
 from cap4d.mesh import rasterize_mesh
 from cap4d.rig.head import HeadRig
 from cap4d.rotation import axis_angle_to_rotmat
-from cap4d.synth.hair import Hair, HairLayer, HairLights, composite_hair, draw_hair, grow_hair
+from cap4d.synth.hair import Hair, HairLayer, HairLights, composite_hair, draw_hair, grow_hair, light_hair
 from cap4d.synth.hair.face import LASHES
 from cap4d.synth.hair.style import STYLES, WEIGHTS
 
@@ -151,7 +151,7 @@ def test_the_bald_have_no_hair_but_brows(egg: HeadRig) -> None:
     assert not hair.scalp.any() and not hair.shadow.any()
     vertices = opencv_from_rig(egg.template.astype(np.float64))
     view = camera(180)
-    layer = draw_hair(hair, hair.pose(vertices), view, LIGHTS, depth_of(egg, vertices, view))
+    layer = draw_hair(light_hair(hair, hair.pose(vertices), LIGHTS), view, depth_of(egg, vertices, view))
     assert not layer.alpha.any()
 
 
@@ -159,43 +159,43 @@ def test_hair_behind_the_head_is_hidden(egg: HeadRig, hair: Hair) -> None:
     vertices = opencv_from_rig(egg.template.astype(np.float64))
     points, view = hair.pose(vertices), camera(0, 128)
     depth = depth_of(egg, vertices, view)
-    free = draw_hair(hair, points, view, LIGHTS)
-    seen = draw_hair(hair, points, view, LIGHTS, depth)
+    free = draw_hair(light_hair(hair, points, LIGHTS), view)
+    seen = draw_hair(light_hair(hair, points, LIGHTS), view, depth)
     rows = [round(view.project(opencv_from_rig(CENTRE + [0, y, 0]))[1]) for y in (0.01, -0.03)]
     face = np.zeros((128, 128), bool)
     face[rows[0] : rows[1], 50:78] = True  # shows the nape's hair, if the head does not hide it
     assert free.alpha[face].max() > 0.2 and seen.alpha[face].max() == 0
     assert seen.alpha[:40].max() > 0.5
-    wall = draw_hair(hair, points, view, LIGHTS, np.full((128, 128), 0.5))
+    wall = draw_hair(light_hair(hair, points, LIGHTS), view, np.full((128, 128), 0.5))
     assert not wall.alpha.any() and not wall.rgb.any()
 
 
 def test_the_picture_does_not_depend_on_the_frame_of_the_world(egg: HeadRig, hair: Hair) -> None:
     vertices = opencv_from_rig(egg.template.astype(np.float64))
     view = camera(30)
-    one = draw_hair(hair, hair.pose(vertices), view, LIGHTS)
+    one = draw_hair(light_hair(hair, hair.pose(vertices), LIGHTS), view)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axis_angle_to_rotmat(np.array([0.2, 0.5, -0.1])), [0.3, 0.1, -0.2]
     turn = pose[:3, :3]
     lights = HairLights(LIGHTS.directions @ turn.T, LIGHTS.strengths, 0.6, 0.4, turn @ LIGHTS.up)
     moved = type(view)(view.K, view.viewmat @ np.linalg.inv(pose), view.width, view.height)
-    other = draw_hair(hair, hair.pose(vertices @ turn.T + pose[:3, 3]), moved, lights)
+    other = draw_hair(light_hair(hair, hair.pose(vertices @ turn.T + pose[:3, 3]), lights), moved)
     assert np.abs(one.rgb - other.rgb).mean() < 1e-3 and np.abs(one.alpha - other.alpha).mean() < 1e-3
 
 
 def test_depth_of_any_whole_multiple_is_taken_and_others_are_refused(egg: HeadRig, hair: Hair) -> None:
     points = hair.pose(opencv_from_rig(egg.template.astype(np.float64)))
     for n in (1, 2, 3):
-        layer = draw_hair(hair, points, camera(), LIGHTS, np.zeros((64 * n, 64 * n)))
+        layer = draw_hair(light_hair(hair, points, LIGHTS), camera(), np.zeros((64 * n, 64 * n)))
         assert layer.rgb.shape == (64, 64, 3) and 0.3 < layer.alpha.max() <= 1
         assert (layer.rgb <= layer.alpha[..., None] + 1e-6).all()
     with pytest.raises(ArgumentError, match="depth: expected a whole multiple"):
-        draw_hair(hair, points, camera(), LIGHTS, np.zeros((100, 64)))
+        draw_hair(light_hair(hair, points, LIGHTS), camera(), np.zeros((100, 64)))
 
 
 def test_hair_behind_the_camera_is_not_drawn(egg: HeadRig, hair: Hair) -> None:
     points = hair.pose(opencv_from_rig(egg.template.astype(np.float64))) - np.float32([0, 0, 5])
-    assert not draw_hair(hair, points, camera(), LIGHTS).alpha.any()
+    assert not draw_hair(light_hair(hair, points, LIGHTS), camera()).alpha.any()
 
 
 def test_compositing_keeps_what_is_bare_and_fills_mattes() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,9 +16,20 @@ from cap4d.mesh import rasterize_mesh
 from cap4d.synth.body import draw_body
 from cap4d.synth.capture import synthesize
 from cap4d.synth.complexion import draw_complexion
+from cap4d.synth.hair import grow_hair
 from cap4d.synth.portrait import draw_person, draw_samples, pose_person
 
 KIND = {"views": 3, "frames": 3, "size": 64}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sparse():
+    """Few strands of hair and few shadows: they take most of the time of drawing a person."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cap4d.synth.portrait.grow_hair", partial(grow_hair, density=0.1))
+        patch.setattr("cap4d.synth.light.SKY_DIRECTIONS", 16)
+        patch.setattr("cap4d.synth.light.LIGHT_SAMPLES", 3)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +106,17 @@ def test_depth_is_along_the_cameras_axis(person):
     fragments = rasterize_mesh(head, person.rig.faces, camera)
     expected = camera.project(fragments.interpolate(head, person.rig.faces)[seen])[:, 2]
     np.testing.assert_allclose(samples.depth[seen], expected, atol=1e-5)
+
+
+def test_a_surface_seen_from_behind_is_dim_and_no_mirror(person):
+    """The bowl of a mouth may be seen from its back; its normals point away there."""
+    head, camera = opencv_from_rig(person.subject.neutral.astype(np.float64)), _front_camera(64)
+    black = replace(person, texture=person.texture * np.float32([0, 0, 0, 1, 1, 1, 1, 1]))
+    outside = pose_person(black, head)
+    inside = replace(outside, normals=-outside.normals, soft=-outside.soft)
+    rig = replace(person.rig, faces=person.rig.faces[:, ::-1], uv_faces=person.rig.uv_faces[:, ::-1])
+    shine = draw_samples(black, outside, camera).rgb.mean()
+    assert 0 < draw_samples(replace(black, rig=rig), inside, camera).rgb.mean() < 0.3 * shine
 
 
 def test_deviations_vanish_at_rest_and_leave_the_eyes_alone(builtin_rig):

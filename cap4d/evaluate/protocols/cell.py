@@ -65,21 +65,18 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """A cell that is done.
+class Judged:
+    """What was measured on K views, whatever the protocol.
 
     Args:
-        folder: Where its avatar and pictures are.
-        values: Per metric, float64[K] of the cell's views; NaN where one could not be measured there.
+        folder: Where the pictures are.
+        values: Per metric, float64[K]; NaN where a view could not be measured.
         missing: Per metric that was not measured, what it needs.
-        fit: The numbers of the fit (`.fit.json`).
     """
 
-    cell: Cell
     folder: Path
     values: dict[str, np.ndarray]
     missing: dict[str, str]
-    fit: dict[str, Any]
 
     def mean(self, metric: str) -> float | None:
         """Over the views where it could be measured; None where it could be in none."""
@@ -89,6 +86,14 @@ class Result:
 
     def picture(self, view: tuple[str, int]) -> Path:
         return self.folder / "pictures" / view[0] / f"{view[1]:05d}.png"
+
+
+@dataclass(frozen=True, eq=False)
+class Result(Judged):
+    """A cell that is done; `fit` are the numbers of its fit (`.fit.json`)."""
+
+    cell: Cell
+    fit: dict[str, Any]
 
 
 Judge = Callable[[Path, Path, Views, int, Path], tuple[dict[str, Sequence[float]], dict[str, str]]]
@@ -114,11 +119,14 @@ def run_cell(cell: Cell, rig: Path, folder: Path, judge: Judge, judged_by: str) 
         values, missing = judge(avatar, cell.capture, cell.views, cell.size, own / "pictures")
         write_verdict(verdict, cell.name, cell.views, values, missing)
     values, missing = read_verdict(verdict, len(cell.views))
-    return Result(cell, own, values, missing, _read(numbers))
+    return Result(own, values, missing, cell, _read(numbers))
 
 
 def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
-    """Fits the avatar; goes on where an interrupted fit of the same cell stopped."""
+    """Fits the avatar; goes on where an interrupted fit of the same cell stopped.
+
+    Without the cheaper deformers: an avatar is judged by its exact one.
+    """
     from cap4d.avatar.fit import fit
     from cap4d.rig.store import load_rig
 
@@ -133,6 +141,7 @@ def fit_cell(cell: Cell, rig: Path, avatar: Path) -> None:
         lpips_weights=cell.lpips_weights,
         references=cell.references,
         hold_out=cell.hold_out,
+        tiers=False,
     )
 
 

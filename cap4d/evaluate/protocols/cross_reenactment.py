@@ -33,17 +33,17 @@ from cap4d.evaluate.metrics.metric import NotMeasured
 from cap4d.evaluate.metrics.registry import metrics_available
 from cap4d.evaluate.metrics.weights import Weights
 from cap4d.evaluate.pair import Pair
-from cap4d.evaluate.protocols.cell import DIGITS, add_files, files_of, read_verdict, write_verdict
+from cap4d.evaluate.protocols.cell import DIGITS, Judged, add_files, files_of, read_verdict, write_verdict
 from cap4d.evaluate.protocols.cells import Failure, check_whole, run_cells
 from cap4d.evaluate.protocols.layout import table
-from cap4d.evaluate.protocols.page import write_truth
-from cap4d.evaluate.protocols.titled_sheet import draw_sheet
+from cap4d.evaluate.protocols.page import Strip, draw_page, write_truth
 from cap4d.player.avatar import Avatar
 
 TRANSFER = ("AED", "APD", "AED-mp", "APD-mp", "gaze", "blink")
 """Metrics of what a face does, whoever's it is."""
 IDENTITY = "CSIM"
-SHOWN = 4  # frames on the page
+SHOWN = 4  # frames of a driver on the page
+DRIVER = "driver"
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -63,23 +63,12 @@ class Cross:
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
-    """An avatar driven by somebody: numbers per frame (NaN: no face there), what is missing, pictures."""
+class Driven(Judged):
+    """An avatar driven by somebody."""
 
     avatar: str
     driver: str
     views: tuple[tuple[str, int], ...]
-    values: dict[str, np.ndarray]
-    missing: dict[str, str]
-    folder: Path
-
-    def mean(self, metric: str) -> float | None:
-        values = self.values.get(metric, np.zeros(0))
-        values = values[np.isfinite(values)]
-        return float(values.mean()) if len(values) else None
-
-    def picture(self, view: tuple[str, int]) -> Path:
-        return self.folder / "pictures" / view[0] / f"{view[1]:05d}.png"
 
 
 def cross_reenactment(
@@ -90,11 +79,12 @@ def cross_reenactment(
     Args:
         avatars: `.cap4d` files.
         drivers: Captures of other people, of the avatars' rig.
-        output: Folder for report.json, table.md, page.png and the cells; made if need be.
+        output: Folder for report.json, table.md, page.html, page.png and the cells; made if need be.
     Raises:
-        ArgumentError: Names that cannot be told apart, or none.
-        DataError: A cell failed: the others are there.
+        ArgumentError: Names that cannot be told apart, or none; a file of the weights that is not there.
+        DataError: A cell failed: the others are there; a file of the weights is no such network.
     """
+    metrics_available(cross.weights, only=(IDENTITY, "AED", "APD"))
     names = _names("avatars", [a.stem for a in avatars], [a.resolve().parent.name for a in avatars])
     people = _names("drivers", [d.resolve().name for d in drivers])
     jobs = [
@@ -124,7 +114,7 @@ def drive(avatar: Path, driver: Path, output: Path, cross: Cross, *, names: tupl
         values, missing = measure(avatar, driver, views, cross, folder / "pictures")
         write_verdict(verdict, " by ".join(names), views, values, missing)
     values, missing = read_verdict(verdict, len(views))
-    return Driven(*names, views, values, missing, folder)
+    return Driven(folder, values, missing, *names, views)
 
 
 def driven_views(capture: Capture, frames: int) -> tuple[tuple[str, int], ...]:
@@ -239,7 +229,7 @@ def markdown(results: Sequence[Driven], failures: Sequence[Failure]) -> list[str
 
 def _draw(output: Path, results: Sequence[Driven], drivers: dict[str, Path], size: int) -> None:
     avatars = list(dict.fromkeys(r.avatar for r in results))
-    rows = []
+    strips = []
     for name in dict.fromkeys(r.driver for r in results):
         own = [r for r in results if r.driver == name]
         capture = Capture.load(drivers[name])
@@ -248,8 +238,8 @@ def _draw(output: Path, results: Sequence[Driven], drivers: dict[str, Path], siz
             file = output / "truth" / name / f"{view[0]}_{view[1]:05d}.png"
             write_truth(capture, view, size, file)
             pictures = {r.avatar: r.picture(view) for r in own}
-            rows.append((f"{name}, frame {view[1]}", {"driver": file, **pictures}))
-    draw_sheet(output / "page.png", ["driver", *avatars], rows)
+            strips.append(Strip(f"{name}, frame {view[1]}", {DRIVER: file, **pictures}))
+    draw_page(output, [DRIVER, *avatars], strips)
 
 
 def _names(kind: str, *choices: list[str]) -> list[str]:

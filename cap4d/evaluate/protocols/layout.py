@@ -69,10 +69,10 @@ def gains_of(results: Sequence[Result]) -> dict[str, list[Gain]]:
     for n, method in rows:
         more = [m for m, other in rows if other == method and m > n]
         if more:
-            pairs[f"{min(more)} references over {n}, {METHODS[method]}"] = ((min(more), method), (n, method))
+            pairs[f"{counted(min(more))} over {n}, {METHODS[method]}"] = ((min(more), method), (n, method))
     for n, method in rows:
         if method != "none" and (n, "none") in rows:
-            pairs[f"ours over {METHODS[method]}, {n} references"] = ((n, "none"), (n, method))
+            pairs[f"ours over {METHODS[method]}, {counted(n)}"] = ((n, "none"), (n, method))
     found = {}
     for title, (ours, theirs) in pairs.items():
         gains = [gain(m, of_row(results, ours), of_row(results, theirs)) for m in metrics]
@@ -80,10 +80,15 @@ def gains_of(results: Sequence[Result]) -> dict[str, list[Gain]]:
     return found
 
 
+def counted(references: int) -> str:
+    """`10 references`"""
+    return f"{references} reference{'s' if references != 1 else ''}"
+
+
 def gain_table(results: Sequence[Result]) -> list[str]:
     """Mean paired gains over identities, and for how many of them the gain is one."""
     metrics = metrics_of(results)
-    lines = _head(["gain (positive: better)", *metrics])
+    lines = _head(["gain (positive: better)", *metrics], words=1)
     for title, gains in gains_of(results).items():
         by_metric = {g.metric: g for g in gains}
         lines.append(_line([title, *(_gain(by_metric.get(m)) for m in metrics)]))
@@ -131,9 +136,10 @@ def _titled(metric: str) -> str:
     return metric + (" ↑" if metric in HIGHER else " ↓")
 
 
-def _head(names: Sequence[str]) -> list[str]:
-    return [_line(names), _line(["---" if i < 2 else "---:" for i in range(len(names))])]
+def _head(names: Sequence[str], *, words: int = 2) -> list[str]:
+    """The first two lines of a table, of which so many columns are words, and all behind them numbers."""
+    return [_line(names), _line(["---" if i < words else "---:" for i in range(len(names))])]
 
 
 def _line(cells: Iterable[object]) -> str:
-    return "| " + " | ".join(map(str, cells)) + " |"
+    return "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"

@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from cap4d.avatar.views import shrink
 from cap4d.capture.capture import Capture
 from cap4d.capture.image import write_image
 from cap4d.evaluate.protocols.cell import Result
-from cap4d.evaluate.protocols.layout import METHODS, of_row, rows_of
+from cap4d.evaluate.protocols.layout import METHODS, counted, of_row, rows_of
 from cap4d.evaluate.protocols.markup import as_html
 from cap4d.evaluate.protocols.titled_sheet import draw_sheet
 
@@ -24,21 +25,29 @@ TRUTH = "truth"
 
 @dataclass(frozen=True)
 class Strip:
-    """One view of one person in all columns: title -> picture file."""
+    """One view of one person in all columns: title -> picture file, in the protocol's folder."""
 
     title: str
     pictures: dict[str, Path]
 
 
 def write_page(output: Path, results: Sequence[Result]) -> None:
-    """Writes page.html and page.png into the protocol's folder, beside table.md, which is its text."""
+    """Of self-reenactment, some views of every person: truth, and every row of the table."""
     strips = [s for identity in _identities(results) for s in strips_of(output, results, identity)]
-    titles = [TRUTH, *(_title(row) for row in rows_of(results))]
-    draw_sheet(output / "page.png", titles, [(s.title, s.pictures) for s in strips])
+    draw_page(output, [TRUTH, *(_title(row) for row in rows_of(results))], strips)
+
+
+def draw_page(output: Path, titles: Sequence[str], strips: Sequence[Strip]) -> None:
+    """Writes page.html and page.png into a protocol's folder, beside table.md, which is its text.
+
+    Args:
+        titles: Of the pictures' columns, in order; a strip need not have all.
+    """
     lines = (output / "table.md").read_text(encoding="utf-8").splitlines()
     body = as_html(lines) + _pictures(output, titles, strips)
     with replacing(output / "page.html") as temporary:
         temporary.write_text(body, encoding="utf-8")
+    draw_sheet(output / "page.png", titles, [(s.title, s.pictures) for s in strips])
 
 
 def strips_of(output: Path, results: Sequence[Result], identity: str) -> list[Strip]:
@@ -81,7 +90,7 @@ def write_truth(capture: Capture, view: tuple[str, int], size: int, file: Path) 
 
 def _title(row: tuple[int, str]) -> str:
     count, method = row
-    return f"{METHODS[method]}, {count} reference{'s' if count > 1 else ''}"
+    return f"{METHODS[method]}, {counted(count)}"
 
 
 def _identities(results: Iterable[Result]) -> list[str]:
@@ -94,7 +103,7 @@ def _pictures(output: Path, titles: Sequence[str], strips: Sequence[Strip]) -> s
         parts.append(f"<h3>{html.escape(strip.title)}</h3><div class='strip'>")
         for title in titles:
             if title in strip.pictures:
-                source = html.escape(strip.pictures[title].relative_to(output).as_posix(), quote=True)
+                source = quote(strip.pictures[title].relative_to(output).as_posix())
                 text = html.escape(title)
                 parts.append(
                     f"<figure><img src='{source}' alt='{text}'><figcaption>{text}</figcaption></figure>"

@@ -23,6 +23,7 @@ from cap4d.avatar.references import choose_held_out, choose_references
 from cap4d.avatar.views import check_rig
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError
+from cap4d.evaluate.evaluate import SIZES
 from cap4d.evaluate.protocols.cell import Cell, Judge, Result, run_cell
 from cap4d.evaluate.protocols.cells import Failure, check_whole, run_cells
 from cap4d.evaluate.protocols.layout import (
@@ -116,11 +117,23 @@ def plan(captures: Sequence[Path], rig: Path, protocol: Protocol) -> list[Cell]:
         )
     if not protocol.references or min(protocol.references) < 1:
         raise ArgumentError(f"references: expected counts from 1 on, got {list(protocol.references)}")
+    _check_numbers(protocol)
     head = load_rig(rig)
     names = _names(captures)
     return [
         cell for path, name in zip(captures, names, strict=True) for cell in _of(path, name, head, protocol)
     ]
+
+
+def _check_numbers(protocol: Protocol) -> None:
+    """Raises ArgumentError for what would only be found out when cells are fitted and judged."""
+    if protocol.frames is not None and protocol.frames < 1:
+        raise ArgumentError(f"frames: expected at least 1, got {protocol.frames}")
+    if protocol.size is not None and not SIZES[0] <= protocol.size <= SIZES[1]:
+        raise ArgumentError(f"size: expected {SIZES[0]} to {SIZES[1]} px, got {protocol.size}")
+    for name in ("seed", "reference_seed"):
+        if not 0 <= getattr(protocol, name) < 2**63:
+            raise ArgumentError(f"{name}: expected 0 to 2^63 - 1, got {getattr(protocol, name)}")
 
 
 def _of(path: Path, name: str, rig: HeadRig, protocol: Protocol) -> list[Cell]:
@@ -143,7 +156,7 @@ def _of(path: Path, name: str, rig: HeadRig, protocol: Protocol) -> list[Cell]:
             preset=protocol.preset,
             seed=protocol.seed,
             views=views,
-            size=protocol.size or protocol.preset.image_size,
+            size=protocol.preset.image_size if protocol.size is None else protocol.size,
             lpips_weights=protocol.lpips_weights,
         )
         for count in protocol.references

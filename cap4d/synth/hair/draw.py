@@ -47,45 +47,91 @@ class HairLayer:
     alpha: np.ndarray
 
 
-def draw_hair(
-    hair: Hair,
-    points: np.ndarray,
-    camera: Camera,
-    lights: HairLights,
-    depth: np.ndarray | None = None,
-    *,
-    threads: int = 1,
-) -> HairLayer:
-    """Draws posed hair.
+@dataclass(frozen=True, eq=False)
+class LitHair:
+    """Hair in one pose under lights, and all of its shading that does not depend on where it is seen from.
 
     Args:
-        hair: Whose hair.
-        points: float32[K, P, 3] from `hair.pose`, in the camera's world, m.
-        camera: Where from.
-        lights: In the same world.
-        depth: [H n, W n] of the mesh along the camera's axis, m, n any whole number; where nothing is, inf or
-            0. None hides nothing.
-        threads: Not used yet: one core draws.
+        points: float32[K, P, 3] from `hair.pose`, m; tangent: [K, P, 3] unit.
+        directions: float32[L, 3] unit, towards the lights.
+        reached: float32[L, K, P] light that a point can throw back; diffuse: float32[K, P].
+    """
+
+    hair: Hair
+    points: np.ndarray
+    tangent: np.ndarray
+    directions: np.ndarray
+    reached: np.ndarray
+    diffuse: np.ndarray
+
+    def seen_from(self, eye: np.ndarray) -> np.ndarray:
+        """float32[K, P, 3] sRGB of every point seen from `eye` [3].
+
+        Kajiya and Kay 1989, with the two highlights that Marschner et al. 2003 found.
+        """
+        hair, to_eye = self.hair, _unit(eye.astype(np.float32) - self.points)
+        tilt = TILT * (np.arange(len(self.points), dtype=np.float32)[:, None] * GOLDEN % 1 - 0.5)
+        gloss, glow = np.zeros_like(self.diffuse), np.zeros_like(self.diffuse)
+        for towards, reached in zip(self.directions, self.reached, strict=True):
+            lean = np.einsum("kpc,kpc->kp", self.tangent, _unit(to_eye + towards)) + tilt
+            gloss += reached * _lobe(lean + GLOSS_SHIFT, GLOSS_POWER)
+            glow += reached * _lobe(lean + GLOW_SHIFT, GLOW_POWER)
+        gloss[hair.skin] *= SKIN_GLOSS
+        sheen = (GLOSS * gloss)[..., None] * (0.5 + 0.5 * np.sqrt(hair.colors))
+        lit = hair.colors * (self.diffuse + 2 * GLOW * glow)[..., None] + sheen
+        return np.clip(np.nan_to_num(lit), 0, 1).astype(np.float32)
+
+
+def light_hair(hair: Hair, points: np.ndarray, lights: HairLights) -> LitHair:
+    """Lights posed hair.
+
+    Args:
+        points: float32[K, P, 3] from `hair.pose`; `lights` in the same world.
     Raises:
-        ArgumentError: A shape does not fit.
+        ArgumentError: Other strands than the hair's.
     """
     if points.shape != hair.strands.shape:
         raise ArgumentError(f"points: expected {list(hair.strands.shape)}, got {list(points.shape)}")
-    depth, n = _checked_depth(depth, camera)
-    if not len(points):
-        return HairLayer(
-            np.zeros((camera.height, camera.width, 3), np.float32),
-            np.zeros(depth.shape, np.float32)[::n, ::n],
-        )
-    large = camera.resized(camera.width * n, camera.height * n)
     turn = _turn_of(hair, points)
+    tangent = _unit(np.gradient(points, axis=1))
+    out = _unit((hair.through @ DIRECTIONS.astype(np.float32) + 1e-4) @ turn.T.astype(np.float32))
+    open_ = hair.through.mean(-1)
+    sky = lights.ground + (lights.sky - lights.ground) * (0.5 + 0.5 * out @ np.float32(lights.up))
+    diffuse = sky * np.minimum(0.18 + 1.7 * open_, 1.15)
+    lengths = np.linalg.norm(lights.directions, axis=1, keepdims=True)
+    directions = (lights.directions / lengths).astype(np.float32)
+    reached = np.empty((len(directions), *open_.shape), np.float32)
+    for i, (towards, strength) in enumerate(zip(directions, lights.strengths, strict=True)):
+        arriving = strength * (hair.through @ weights_towards(turn.T @ towards))
+        across = np.sqrt(np.maximum(1 - (tangent @ towards) ** 2, 0))
+        facing = np.clip((out @ towards + 0.4) / 1.4, 0, 1)
+        diffuse += arriving * (0.35 * across + 1.15 * facing)
+        reached[i] = arriving * facing
+    return LitHair(hair, points, tangent, directions, reached, diffuse)
+
+
+def draw_hair(lit: LitHair, camera: Camera, depth: np.ndarray | None = None) -> HairLayer:
+    """Draws hair in front of a mesh.
+
+    Args:
+        camera: Where from, in the points' world.
+        depth: [H n, W n] of the mesh along the camera's axis, m, n any whole number; where nothing is, inf or
+            0. None hides nothing.
+    Raises:
+        ArgumentError: The depth's shape does not fit.
+    """
+    depth, n = _checked_depth(depth, camera)
+    hair, points = lit.hair, lit.points
+    if not len(points):
+        rgb = np.zeros((camera.height, camera.width, 3), np.float32)
+        return HairLayer(rgb, np.zeros(rgb.shape[:2], np.float32))
+    large = camera.resized(camera.width * n, camera.height * n)
     xyz = _project(points, large)
     rgba = np.empty((*points.shape[:2], 4), np.float32)
-    rgba[..., :3] = light_hair(hair, points, camera.position, lights, turn)
+    rgba[..., :3] = lit.seen_from(camera.position)
     rgba[..., 3] = OPACITY
-    widths = (
-        hair.widths * np.float32(0.5 * (large.K[0, 0] + large.K[1, 1])) / np.maximum(xyz[..., 2], MIN_DEPTH)
-    )
+    focal = np.float32(0.5 * (large.K[0, 0] + large.K[1, 1]))
+    widths = hair.widths * focal / np.maximum(xyz[..., 2], MIN_DEPTH)
     rgb, clear = _core.draw_strands(xyz, rgba, widths.astype(np.float32), depth, SOFTNESS)
     return HairLayer(_smaller(rgb, n), 1 - _smaller(clear, n))
 
@@ -97,42 +143,6 @@ def composite_hair(rgb: np.ndarray, matte: np.ndarray, layer: HairLayer) -> tupl
     premultiplied = layer.rgb + rgb * (matte * left)[..., None]
     straight = premultiplied / np.maximum(alpha, 1e-6)[..., None]
     return np.clip(np.where(alpha[..., None] > 1e-6, straight, 1), 0, 1), alpha
-
-
-def light_hair(
-    hair: Hair, points: np.ndarray, eye: np.ndarray, lights: HairLights, turn: np.ndarray
-) -> np.ndarray:
-    """float32[K, P, 3] sRGB of every point seen from `eye` [3].
-
-    Kajiya and Kay 1989, with the two highlights that Marschner et al. 2003 found.
-
-    Args:
-        turn: [3, 3] world from the head's axes.
-    """
-    tangent = _unit(np.gradient(points, axis=1))
-    out = _unit((hair.through @ DIRECTIONS.astype(np.float32) + 1e-4) @ turn.T.astype(np.float32))
-    to_eye = _unit(eye.astype(np.float32) - points)
-    open_ = hair.through.mean(-1)
-    sky = lights.ground + (lights.sky - lights.ground) * (0.5 + 0.5 * out @ np.float32(lights.up))
-    diffuse = sky * np.minimum(0.18 + 1.7 * open_, 1.15)
-    tilt = TILT * (np.arange(len(points), dtype=np.float32)[:, None] * GOLDEN % 1 - 0.5)
-    gloss, glow = np.zeros_like(open_), np.zeros_like(open_)
-    for direction, strength in zip(lights.directions, lights.strengths, strict=True):
-        towards = np.float32(direction / np.linalg.norm(direction))
-        reached = strength * (hair.through @ weights_towards(turn.T @ towards))
-        along = tangent @ towards
-        across = np.sqrt(np.maximum(1 - along**2, 0))
-        facing = np.clip((out @ towards + 0.4) / 1.4, 0, 1)
-        diffuse += reached * (0.35 * across + 1.15 * facing)
-        half = _unit(to_eye + towards)
-        lean = np.einsum("kpc,kpc->kp", tangent, half) + tilt
-        reached *= facing
-        gloss += reached * _lobe(lean + GLOSS_SHIFT, GLOSS_POWER)
-        glow += reached * _lobe(lean + GLOW_SHIFT, GLOW_POWER)
-    gloss[hair.skin] *= SKIN_GLOSS
-    sheen = (GLOSS * gloss)[..., None] * (0.5 + 0.5 * np.sqrt(hair.colors))
-    lit = hair.colors * (diffuse + 2 * GLOW * glow)[..., None] + sheen
-    return np.clip(np.nan_to_num(lit), 0, 1).astype(np.float32)
 
 
 def _smaller(image: np.ndarray, n: int) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from cap4d import _core
@@ -9,13 +11,21 @@ from cap4d.rig.head import HeadRig
 from cap4d.synth.hair.scalp import HeadMeasures, Roots
 
 RESOLUTION = 0.00025  # m a pixel of the front view in which roots are found
-BROW_WIDTH = 0.0075  # m
-BROWS, LASHES = 420, 80  # strands on a side; of an upper lid
-LASH = 0.0042  # m
+BROW_WIDTH = 0.0068  # m
+BROWS, LASHES = 360, 80  # strands on a side; of an upper lid
 # An eyebrow when the rig has no landmarks: distance from the middle and height over the eyes, in halves of
 # the distance between the eyes.
 BROW_LINE = np.array([[0.42, 0.56], [0.75, 0.68], [1.15, 0.76], [1.5, 0.70], [1.78, 0.50]])
 LEFT_BROW, RIGHT_BROW = slice(22, 27), slice(17, 22)  # of 68 landmarks
+
+
+@dataclass(frozen=True)
+class Short:
+    """Short hair: its length, m, and how far it bends upwards and leaves the skin on its way, in lengths."""
+
+    length: float
+    bend: float
+    lift: float
 
 
 class FrontView:
@@ -54,7 +64,7 @@ def grow_brows(
     lines: list[np.ndarray], head: HeadMeasures, view: FrontView, points: int, rng: np.random.Generator
 ) -> tuple[Roots, np.ndarray]:
     """Roots and strands [K, points, 3] m."""
-    thickness, length = rng.uniform(0.75, 1.25), rng.uniform(0.006, 0.009)
+    thickness, length = rng.uniform(0.75, 1.25), rng.uniform(0.005, 0.0075)
     roots, along = [], []
     for line in lines:
         t = rng.beta(1.05, 1.15, BROWS)
@@ -64,9 +74,10 @@ def grow_brows(
         middle[:, 1] += np.clip(rng.normal(0, 0.5, BROWS), -1, 1) * half
         roots.append(middle)
         outwards = np.sign(line[-1, 0] - line[0, 0])
-        up = np.interp(t, [0, 0.25, 0.7, 1], [1.3, 0.6, 0.0, -0.35]) + rng.normal(0, 0.22, BROWS)
+        up = np.interp(t, [0, 0.25, 0.7, 1], [0.9, 0.45, 0.0, -0.35]) + rng.normal(0, 0.22, BROWS)
         along.append(np.stack([outwards * np.ones(BROWS), up, 0.25 + 0 * up], 1))
-    return _short(view, head, np.concatenate(roots), np.concatenate(along), length, 0.15, points, rng)
+    kind = Short(length, bend=0.1, lift=-0.02)  # they hug the brow, which curves away under them
+    return _grow_short(kind, view, head, np.concatenate(roots), np.concatenate(along), points, rng)
 
 
 def grow_lashes(
@@ -84,11 +95,20 @@ def grow_lashes(
     xy = view.low + (np.stack([chosen, upper + 4], 1) + rng.random((len(chosen), 2))) * RESOLUTION
     outer = (np.abs(xy[:, 0]) - head.half) / (0.5 * head.half)
     way = np.stack([np.sign(xy[:, 0]) * 0.7 * outer, 0.35 + 0 * outer, 1 + 0 * outer], 1)
-    return _short(view, head, xy, way + rng.normal(0, 0.06, way.shape), LASH, 0.9, points, rng)
+    way = way + rng.normal(0, 0.06, way.shape)
+    return _grow_short(Short(0.0042, bend=0.9, lift=0.12), view, head, xy, way, points, rng)
 
 
-def _short(view, head, xy, way, length, curve, points, rng):
-    """Strands from under `xy`, along `way` [K, 3] over the skin, that bend up by `curve`."""
+def _grow_short(
+    kind: Short,
+    view: FrontView,
+    head: HeadMeasures,
+    xy: np.ndarray,
+    way: np.ndarray,
+    points: int,
+    rng: np.random.Generator,
+) -> tuple[Roots, np.ndarray]:
+    """Roots under `xy` [K, 2], where there is a face, and strands that leave them along `way` [K, 3]."""
     roots = view.roots(xy)
     seen = (
         view.face[tuple(np.clip(((xy - view.low) / RESOLUTION).astype(int), 0, view.size - 1).T[::-1])] >= 0
@@ -96,8 +116,8 @@ def _short(view, head, xy, way, length, curve, points, rng):
     start, normal, way = roots.on(head.vertices), roots.on(head.normals), way[seen]
     inward = np.minimum((way * normal).sum(1, keepdims=True), 0)
     way = way - inward * normal
-    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9) + 0.12 * normal
+    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9) + kind.lift * normal
     t = np.linspace(0, 1, points)[None, :, None]
-    far = length * rng.uniform(0.6, 1.1, (len(start), 1, 1)) * t
-    bend = np.array([0, 1.0, 0]) * curve * t
+    far = kind.length * rng.uniform(0.6, 1.1, (len(start), 1, 1)) * t
+    bend = np.array([0, 1.0, 0]) * kind.bend * t
     return roots, start[:, None] + far * (way[:, None] + bend) + 2e-4 * normal[:, None]

@@ -18,7 +18,7 @@ BALD_POINTS = 6  # of a strand when there are only eyebrows and lashes
 REAL_STRANDS = 100_000  # on a head: how many the drawn ones stand for, for their shadows
 ROOT_HOLD = 0.02  # m along a strand over which it lets go of its patch of skin and follows the skull
 HAIR_WIDTH = 2.2e-4  # m, of a drawn strand, which stands for several
-BROW_BRIGHTEST = 0.36  # of sRGB: fair people's eyebrows are darker than their hair
+BROW_BRIGHTEST = 0.27  # of sRGB: lit without a neighbour's shadow, they are to look darker than fair hair
 DARK = 0.66  # of the skin's brightness: what a rig has painted darker on the scalp is taken for hair
 
 
@@ -215,7 +215,7 @@ def _colors(strands: np.ndarray, kind: np.ndarray, color: np.ndarray, rng: np.ra
     tone = tone * np.exp(rng.normal(0, 0.03, (count, 1, 3)))
     along = np.linspace(0, 1, points)[None, :, None]
     grey = np.full(3, color.mean())
-    face = 0.6 * (0.6 * color + 0.4 * grey * [1.15, 1.0, 0.85])
+    face = 0.55 * (0.75 * color + 0.25 * grey * [1.15, 1.0, 0.85])
     face = face * min(1, BROW_BRIGHTEST / face.max())
     base = np.stack([color, face, 0.3 * face])[kind][:, None]
     return np.clip(base * tone * (0.82 + 0.3 * along) + 0.01, 0, 1).astype(np.float32)
