@@ -206,9 +206,8 @@ def test_the_panel_offers_what_the_avatar_has() -> None:
             imgui.render()
             corners.append(imgui.get_draw_data().total_vtx_count)
             assert viewer.overlays == frozenset(Overlay)  # kept for the next avatar
-        assert corners[1] < corners[0] - 2 * 4 * len(
-            "Bytheexpression"
-        )  # two ticks less, and no parts to choose
+        unwritten = 4 * len("Bytheexpression")  # corners of letters: there are no parts to choose
+        assert corners[1] < corners[0] - 2 * unwritten
     finally:
         for texture in imgui.get_platform_io().textures:
             texture.set_status(imgui.ImTextureStatus.destroyed)

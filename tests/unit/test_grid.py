@@ -41,6 +41,7 @@ def positions(rig, grid):
 
 def test_pixels_lie_where_fact_16_puts_them(square):
     grid = build_grid(square, SIZE)
+    np.testing.assert_array_equal(np.argwhere(grid.valid), grid.pixels)
     row, column = grid.pixels.T
     expected = np.stack([1 - (column + 0.5) / SIZE, (row + 0.5) / SIZE], -1)
     np.testing.assert_allclose(positions(square, grid)[:, :2], expected, atol=1e-6)
