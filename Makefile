@@ -16,7 +16,8 @@ SANITIZED := build/sanitize
 SANITIZERS := -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer -g -O1
 SANITIZED_TESTS := $(wildcard tests/property/test_hard_*.py) $(addprefix tests/,$(addsuffix .py,property/test_splatting_gradients \
   $(addprefix parity/test_,float_answers player quantized_answers splatting) \
-  $(addprefix unit/test_,avatar_bound bench_floor bind float_unet mesh player_avatar player_tiers quantized_unet raster render sort splatter)))
+  $(addprefix unit/test_,avatar_bound avatar_similarity bench_floor bind fast_deformer float_unet mesh player_avatar player_tiers quantized_unet \
+  raster render sort splatter synth_hair synth_studio)))
 
 .PHONY: demo test bench lint sanitize sanitize-base sanitize-v3 sanitize-v4 sanitize-threads clean
 .DELETE_ON_ERROR:
