@@ -171,7 +171,7 @@ def test_the_short_schedules_are_those_that_were_measured():
     assert (low.iterations, low.gaussians, low.densify.most) == (2_500, 40_000, 90_000)
     for preset in PRESETS.values():
         assert preset.recipe == "short"
-        assert preset.rates.gaussian_eps == 1e-8
+        assert preset.rates.gaussian_eps == (1e-8 if preset.name == "debug" else 1e-7)
         assert preset.perceptual == Perceptual()
         assert (preset.weights.l2, preset.weights.position, preset.weights.position_limit) == (5.0, 1e-2, 0.7)
         assert preset.corrections == "auto"

@@ -139,7 +139,7 @@ def test_a_wrong_selection_is_refused(ring, references, hold_out, found):
 
 
 def test_few_images_hold_hidden_gaussians_still():
-    short, released = (preset_named("low", recipe) for recipe in ("short", "released"))
+    short, released = (preset_named("debug", recipe) for recipe in ("short", "released"))
     eps = [suited(short, count).rates.gaussian_eps for count in (1, 2, 10, 1000)]
     assert eps == pytest.approx([1e-5, 1.25e-6, 1e-8, 1e-8])
     assert replace(suited(short, 1), rates=short.rates) == short
