@@ -9,8 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +32,7 @@ from cap4d.camera import opencv_from_rig
 from cap4d.capture.capture import Capture
 from cap4d.errors import ArgumentError
 from cap4d.perceptual.lpips import LPIPS_NEEDS, find_lpips, load_lpips
+from cap4d.raster.threads import one_torch_thread
 from cap4d.rig.grid import build_grid, own_triangles
 from cap4d.rig.head import HeadRig
 
@@ -42,19 +42,6 @@ ABLATIONS = (None, "unet", "lpips", "remesh", "mmdm")
 PAINT_VIEWS = 16
 REPORT_SECONDS = 10.0  # between progress lines
 LOST_SECONDS = 600.0  # of work that a kill may cost, however slow the steps
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """What takes time is in C++ with threads of its own; torch's only wait for more work on its cores, and
-    sum in an order that depends on their number.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def fit(

@@ -11,7 +11,7 @@ from cap4d.bundle.bundle import Bundle
 from cap4d.harmonics import sh_basis
 from cap4d.optimize.removal import blending_weights
 from cap4d.optimize.scene import Scene, tensors
-from cap4d.optimize.threads import one_torch_thread
+from cap4d.raster.threads import one_torch_thread
 
 RIDGE = 0.05
 """Pull towards the coefficients that are kept, as a share of a seen direction's weight: what was seen from

@@ -18,9 +18,9 @@ from cap4d.camera import opencv_from_rig
 from cap4d.drive.clip import Frame
 from cap4d.gaussians import SH_COUNTS
 from cap4d.optimize.shots import Shot
-from cap4d.optimize.threads import one_torch_thread
 from cap4d.player.tiers import choose_tier, moving_subject
 from cap4d.raster.reference import rasterize_reference
+from cap4d.raster.threads import one_torch_thread
 from cap4d.track.progress import progress
 
 LOCAL = ("means", "quats", "log_scales")

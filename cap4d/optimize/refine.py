@@ -9,8 +9,8 @@ import torch
 
 from cap4d.bundle.bundle import Bundle
 from cap4d.optimize.scene import FIELDS, Scene, tensors
-from cap4d.optimize.threads import one_torch_thread
 from cap4d.raster import rasterize
+from cap4d.raster.threads import one_torch_thread
 
 RATES = {"means": 9e-3, "quats": 3.6e-3, "log_scales": 9e-3, "opacity_logits": 3.6e-2, "sh": 4.5e-3}
 """Adam's first rates; the last are a tenth."""

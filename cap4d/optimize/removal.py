@@ -14,7 +14,7 @@ from cap4d import _core
 from cap4d.bundle.bundle import Bundle
 from cap4d.gaussians import SH_COUNTS
 from cap4d.optimize.scene import Scene, tensors
-from cap4d.optimize.threads import one_torch_thread
+from cap4d.raster.threads import one_torch_thread
 
 HIGHEST = np.float32(0.98)  # opacities are kept below the clamp, above which the gradient is 0
 BACKGROUNDS = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
