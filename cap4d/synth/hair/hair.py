@@ -36,8 +36,7 @@ class Hair:
         through: float32[K, P, D] light that gets through to a point, of `occlusion.DIRECTIONS`.
         neutral: float64[V, 3] the head it was grown on.
         skull: int[S] vertices whose motion is the skull's.
-        scalp: float32[V] share of the full density of hair over a vertex; brow: the same of eyebrows.
-        painted: bool[V]; where the rig's own colours paint hair that this hair replaces.
+        scalp: float32[V] share of the full density of hair over a vertex.
         shadow: float32[V] share of the light that the hair keeps from the mesh.
         color: [3] sRGB, the mean.
     """
@@ -52,8 +51,6 @@ class Hair:
     neutral: np.ndarray
     skull: np.ndarray
     scalp: np.ndarray
-    brow: np.ndarray
-    painted: np.ndarray
     shadow: np.ndarray
     color: np.ndarray
 
@@ -101,20 +98,6 @@ class Hair:
         offsets = self.strands[self.skin] - roots.on(self.neutral)[:, None]
         return roots.on(vertices)[:, None] + offsets @ rotation.swapaxes(-1, -2)
 
-    def shade_scalp(self, colors: np.ndarray) -> np.ndarray:
-        """sRGB albedo [V, 3] of the mesh with the skin under the hair tinted, painted hair taken away."""
-        colors = np.array(colors, np.float64)
-        tone = skin_tone(colors, self.painted | (self.brow > 0))
-        colors[self.painted] = tone
-        under = 0.6 * self.color + 0.1 * tone
-        tint = np.maximum(0.92 * self.scalp, 0.35 * self.brow)[:, None]
-        return colors * (1 - tint) + tint * under
-
-
-def skin_tone(colors: np.ndarray, painted: np.ndarray) -> np.ndarray:
-    """[3] the median of what is not painted as hair."""
-    return np.median(colors[~painted], 0) if (~painted).any() else np.median(colors, 0)
-
 
 def grow_hair(
     rig: HeadRig, neutral: np.ndarray, *, seed: int, style: str | None = None, density: float = 1.0
@@ -122,7 +105,7 @@ def grow_hair(
     """Hair, eyebrows and lashes for a subject's neutral head.
 
     Args:
-        rig: Any rig; only its faces, colours and regions are read.
+        rig: Any rig; only its faces and regions are read.
         neutral: [V, 3] m, rig axes.
         seed: Same seed, same hair.
         style: A name of `style.STYLES`; None draws one.
@@ -186,8 +169,6 @@ def _finish(rig, head, surface, name, scalp, cover, color, rng) -> Hair:
         neutral=head.vertices,
         skull=_skull(head),
         scalp=cover.astype(np.float32),
-        brow=_brow_cover(head, lines),
-        painted=_painted(rig, head),
         shadow=shadow,
         color=color,
     )
@@ -232,37 +213,6 @@ def _skull(head: HeadMeasures) -> np.ndarray:
     high, behind = head.height(head.vertices) > 0.35, head.angle(head.vertices) > 60
     ids = np.flatnonzero(high & behind & head.outer)
     return ids if len(ids) >= 3 else np.flatnonzero(head.outer)
-
-
-def _brow_cover(head: HeadMeasures, lines: list[np.ndarray]) -> np.ndarray:
-    """float32[V] 1 along the middle of an eyebrow, 0 beside it."""
-    cover = np.zeros(len(head.vertices))
-    front = head.outer & (head.vertices[:, 2] > head.centre[2]) & (head.normals[:, 2] > 0)
-    for line in lines:
-        fine = np.stack([np.interp(np.linspace(0, 4, 40), range(5), line[:, a]) for a in (0, 1)], 1)
-        near = np.linalg.norm(head.vertices[:, None, :2] - fine, axis=-1).min(1)
-        cover = np.maximum(cover, np.clip(1.4 - near / 0.004, 0, 1) * front)
-    return cover.astype(np.float32)
-
-
-def _painted(rig: HeadRig, head: HeadMeasures) -> np.ndarray:
-    """bool[V] where the rig's colours show hair or eyebrows: dark, and at or above the eyes, or on an ear."""
-    if rig.colors is None:
-        return np.zeros(len(head.vertices), bool)
-    light = np.asarray(rig.colors, np.float64).mean(1)
-    face = head.outer & (head.normals[:, 2] > 0.5) & (np.abs(head.height(head.vertices)) < 0.6)
-    tone = np.median(light[face]) if face.any() else np.median(light)
-    where = (head.height(head.vertices) > 0.13) | (head.angle(head.vertices) > 50)
-    high = head.height(head.vertices) > -0.9
-    on_scalp = (head.height(head.vertices) > 0.42) | (head.angle(head.vertices) > 50)
-    dark = light < np.where(on_scalp, 0.9, DARK) * tone
-    if "hair" in rig.regions:
-        dark[rig.regions["hair"]] = True
-    painted = head.outer & where & high & dark
-    for _ in range(2):  # what is painted fades out over a few triangles
-        touched = head.faces[painted[head.faces].any(1)]
-        painted[touched] = True
-    return painted & head.outer
 
 
 def _frames(corners: np.ndarray) -> np.ndarray:
